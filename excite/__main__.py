@@ -21,8 +21,8 @@ from excite.cli import (  # noqa: E402
 )
 from excite.errors import ExciteError  # noqa: E402
 
-# Errors of the file system that the user can mend: full disk, quota, read-only file system, no permission.
-USERS_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
+# Errors of the file system that the user can mend: full disk, quota, too large a file, read-only, no permission.
+USERS_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
 
 
 def main() -> None:
@@ -46,7 +46,9 @@ def main() -> None:
                 fail(f"{str(err.filename)[:40]}...: is too long a name for a file", 2)
             code = _exit_code(err)
             if code is not None:
-                fail(" ".join(str(err).split()), code)
+                where = getattr(err, "filename", None) or "the output"
+                said_of = f"{where}: can't be written: {err.strerror or err}" if isinstance(err, OSError) else str(err)
+                fail(" ".join(said_of.split()), code)
             if not said.stop:
                 raise
             fail("interrupted, nothing was written", INTERRUPTED)

@@ -93,12 +93,22 @@ class InfeasibleError(ExciteError, ValueError):
         return type(self), (str(self), self.limit, self.excess)
 
 
+class StoppedError(ExciteError):
+    """Work that was stopped (Ctrl-C) before it had a result; the message says how far it was."""
+
+    exit_code = 130  # as shells have it
+
+
 class ServeError(FailedError):
     """The driver's page can't be served."""
 
 
 class WorkerError(FailedError):
     """The workers of a study are lost."""
+
+
+class DiskError(FailedError):
+    """A result can't be written: a full disk, a quota, a limit of the size of files."""
 
 
 class RowStoreError(FailedError):

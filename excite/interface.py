@@ -1,8 +1,8 @@
 """The functions of `import excite`.
 
 A machine is given by its name, its file or a model; a problem by name; a log as a path, a pandas DataFrame in the
-machine's columns, or a `Log`; a drive as a profile, a design folder, a `Design` or a `Motion`. Defaults are those of
-the command of the same name.
+machine's columns, or a `Log`; a drive as a profile, its DataFrame, a design folder, a `Design` or a `Motion`.
+Defaults are those of the command of the same name.
 
 A result prints as its command prints it, in a notebook too. `to_frame()` gives its numbers as a DataFrame with units in
 `attrs["units"]`, `plot()` the figure of its report, `save(folder)` the files of the command (`excite.reports.Shown`).
@@ -56,7 +56,7 @@ __version__ = version("excite")
 
 Machine = str | Path | Model
 Source = str | Path | pd.DataFrame | Log
-Drive = str | Path | np.ndarray | Design | Motion
+Drive = str | Path | np.ndarray | pd.DataFrame | Design | Motion
 
 
 def load(machine: Machine) -> Model:
@@ -71,7 +71,7 @@ def load(machine: Machine) -> Model:
 def read_log(machine: Machine, source: Source) -> ShownLog:
     """Read and check a log of a machine.
 
-    source: a file (.csv, .txt, .parquet, .mat, .mf4) or a DataFrame in the machine's columns.
+    source: a file of any kind in `excite.logs.FORMATS` or a DataFrame in the machine's columns.
     Raises LogError: what is wrong, where (row, column), what to do.
     """
     model = load(machine)
@@ -406,6 +406,8 @@ def _planned(model: Model, drive: Drive, any_rate: bool = False) -> PlannedDrive
         drive = drive.motion
     if isinstance(drive, Motion):
         return PlannedDrive(drive.u, drive.q[0], drive.nu[0], drive.q, drive.nu)
+    if isinstance(drive, pd.DataFrame):
+        return readers.read_drive(drive, model, any_rate)
     path = Path(drive)
     return readers.read_drive(path / "profile.csv" if path.is_dir() else path, model, any_rate)
 

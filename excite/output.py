@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import glob
 import json
 import os
@@ -19,9 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from excite.errors import FolderError
+from excite.errors import DiskError, FolderError
 
 SUMMARY = "summary.json"
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # what the user can mend, and no defect of the program
 REQUEST_KEYS = (
     "objective",
     "duration_s",
@@ -33,8 +35,8 @@ REQUEST_KEYS = (
 )  # entries of a summary that say how a result was made
 # names of the files that the program writes into a result folder
 OWN_NAMES = re.compile(
-    r"summary\.json|machine\.(json|toml)|contact\.toml|(profile|phases|covariance|prediction)\.csv|README\.md"
-    r"|[a-z0-9-]+\.(png|svg|pdf|html|md)|design|verify|next|drives|runs\.parquet|study\.json|machines"
+    r"summary\.json|machine\.(json|toml)|contact\.toml|(profile|phases|covariance|tolerances|prediction|wiring|log_template)\.csv|README\.md"
+    r"|motion\.(csv|yaml|script|src|mod)|bag|[a-z0-9-]+\.(png|svg|pdf|html|md)|design|verify|next|drives|runs\.parquet|study\.json|machines"
 )
 
 
@@ -104,7 +106,7 @@ def describe_result(out: Path) -> str | None:
     made = f"{datetime.fromtimestamp(path.stat().st_mtime):%Y-%m-%d %H:%M}"
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return made
     if isinstance(found, dict) and isinstance(found.get("design"), dict):  # written by `excite run`
         found = found["design"]
@@ -138,20 +140,38 @@ def new_folder(out: Path, option: str = "--out") -> Iterator[Path]:
     """
     check_out_folder(out, option=option)
     made = _make_parents(out)
-    partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
+    partial: Path | None = None
     try:
-        yield partial
-        partial.chmod(0o755)
-        if out.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".old", dir=out.parent))
-            out.replace(old / out.name)
-            partial.replace(out)
-            shutil.rmtree(old)
-        else:
-            partial.replace(out)
+        with _disk(out):
+            partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
+            yield partial
+            partial.chmod(0o755)
+            if out.exists():
+                old = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".old", dir=out.parent))
+                out.replace(old / out.name)
+                partial.replace(out)
+                shutil.rmtree(old)
+            else:
+                partial.replace(out)
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        if partial is not None:
+            shutil.rmtree(partial, ignore_errors=True)
         _remove_empty(made)
+
+
+@contextmanager
+def _disk(out: Path) -> Iterator[None]:
+    """Say what could not be written, and where. Raises DiskError."""
+    try:
+        yield
+    except OSError as err:
+        if err.errno not in FULL:
+            raise
+        part = f" ({Path(os.fsdecode(err.filename)).name})" if err.filename else ""
+        raise DiskError(
+            f"{out}: could not be written{part}: {os.strerror(err.errno)}; nothing is left of it, free some space or"
+            " choose another --out"
+        ) from None
 
 
 def remove_partial_folders(out: Path) -> None:
@@ -161,20 +181,29 @@ def remove_partial_folders(out: Path) -> None:
 
 
 @contextmanager
-def new_file(out: Path) -> Iterator[Path]:
-    """Yield a file to write that becomes `out` if the block succeeds. Raises FolderError."""
+def new_file(out: Path, replace: bool = True) -> Iterator[Path]:
+    """Yield a file to write that becomes `out` if the block succeeds.
+
+    replace: False to raise FileExistsError rather than to replace a file that appeared meanwhile. Raises FolderError.
+    """
     if out.is_dir():
         raise FolderError(f"{out}: is a folder, --out needs a file name")
     _check_writable(out)
     made = _make_parents(out)
-    handle, name = tempfile.mkstemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent)
-    os.close(handle)
+    name: str | None = None
     try:
-        yield Path(name)
-        Path(name).chmod(0o644)
-        Path(name).replace(out)
+        with _disk(out):
+            handle, name = tempfile.mkstemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent)
+            os.close(handle)
+            yield Path(name)
+            Path(name).chmod(0o644)
+            if replace:
+                Path(name).replace(out)
+            else:
+                os.link(name, out)
     finally:
-        Path(name).unlink(missing_ok=True)
+        if name is not None:
+            Path(name).unlink(missing_ok=True)
         _remove_empty(made)
 
 

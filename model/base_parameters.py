@@ -13,6 +13,8 @@ from excite.errors import MachineError
 from excite.model.machine import Machine
 from excite.model.mechanics import independent_columns
 
+INDEPENDENT = 1e-7  # least share of a regressor's column beyond those before it: lengths are rounded to 1e-7 m at most
+
 
 @dataclass(frozen=True)
 class BaseParameters:
@@ -54,19 +56,19 @@ def base_parameters(machine: Machine, W: ca.Function, p: np.ndarray, units: dict
     standard = tuple(units)
     n = len(machine.coordinates)
     rng = np.random.default_rng(0)
-    samples = max(60, 4 * len(standard))
+    samples = max(60, 2 * len(standard))
     q, nu, a = (rng.uniform(-1, 1, (n, samples)) for _ in range(3))
     flat = W(q, nu, a, p).full().reshape(n, samples, len(standard))
-    A = flat.transpose(1, 0, 2).reshape(-1, len(standard))
+    A = np.asarray(np.linalg.qr(flat.transpose(1, 0, 2).reshape(-1, len(standard)), mode="r"))
     size = np.linalg.norm(A, axis=0)
     visible = np.flatnonzero(size > 1e-12 * size.max())
-    kept, left = (visible[k] for k in independent_columns(A[:, visible] / size[visible], 1e-9))
+    A[:, visible] /= size[visible]
+    kept, left = (visible[k] for k in independent_columns(A[:, visible], INDEPENDENT))
     matrix = np.zeros((len(standard), len(standard)))
     matrix[kept, kept] = 1.0
-    for j in left:
-        before = kept[kept < j]
-        coefficients = np.linalg.lstsq(A[:, before], A[:, j], rcond=None)[0]
-        matrix[before, j] = np.where(np.abs(coefficients) < 1e-9, 0.0, np.round(coefficients, 12))
+    shares = np.linalg.lstsq(A[:, kept], A[:, left], rcond=None)[0] * size[left] / size[kept, None]
+    shares[(np.abs(shares) < 1e-9) | (kept[:, None] > left)] = 0.0
+    matrix[np.ix_(kept, left)] = np.round(shares, 12)
     if not len(kept):
         raise MachineError(
             f"{machine.name}: no parameter can be seen in any motion, check the table and what is locked"

@@ -159,6 +159,8 @@ def symbolic_sample(
         for b in machine.body:
             if b.moves_with is not None:
                 moving[b.coordinates[0]] = machine.ratio(b) * moving[machine.coordinate(b)]
+                if moving is at or moving is read:
+                    moving[b.coordinates[0]] += machine.offset(b)
     heading = at[machine.body[0].coordinates[2]] if machine.planar else ca.SX(0)
     gravity = mechanics.rot_z(-heading) @ ca.DM(machine.gravity)
     smoothed = {
@@ -201,6 +203,30 @@ def signed_balance(machine: Machine, standard: tuple[str, ...], placed: Sequence
     _, _, z, acting = _active_effects(s, placed)
     beside = [s.u, z] if placed else []
     return ca.Function("signed_balance", [s.q, s.nu, s.a, s.p, *beside, sign], [_balance(s, acting)[0]])
+
+
+def force_directions(machine: Machine, standard: tuple[str, ...]) -> tuple[tuple[tuple[int, str], ...], ca.Function]:
+    """Return names of forces that each contact may have, and the function (q, p) of their generalised unit forces.
+
+    The forces are (n_q, n_forces) [N, N m], p the standard parameters. A name is the contact's body and one of:
+    "lengthwise", on chassis and rim; "lateral"; "turning", the moment about the vertical axis; "resistance", lengthwise
+    at the axle alone. They follow from virtual power as the soil's do.
+    """
+    s = symbolic_sample(machine, standard)
+    found: dict[tuple[int, str], ca.SX] = {}
+    for body in machine.contacts:
+        assert body.contact is not None
+        lever, radius = _contact_motion(s, body)[1], float(body.contact.radius)
+        units = {
+            "lengthwise": (1, 0, -radius, 0),
+            "lateral": (0, 1, 0, 0),
+            "turning": (0, 0, 0, 1),
+            "resistance": (1, 0, 0, 0),
+        }
+        forces = {kind: lever.T @ ca.DM(unit) for kind, unit in units.items()}
+        found |= {(body.index, kind): force for kind, force in forces.items() if force.nnz()}
+    forces = ca.densify(ca.horzcat(ca.SX(len(s.names), 0), *found.values()))
+    return tuple(found), ca.Function("forces", [s.q, s.p], [forces], ["q", "p"], ["forces"])
 
 
 def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[PlacedEffect]) -> Equations:
@@ -386,11 +412,20 @@ def _friction_torque(s: SymbolicSample, body: Body) -> ca.SX:
     return s.by_name[f"Fv{k}"] * w + s.by_name[f"Fs{k}"] * s.sign[k]
 
 
+def _rotor_acceleration(s: SymbolicSample, body: Body) -> ca.SX:
+    """Return the acceleration of a joint's rotor as seen at the joint, with that of a joint which turns it as well."""
+    also = s.machine.turned_with(body)
+    own = s.accel[body.coordinates[0]]
+    return own if also is None else own + also[1] * s.accel[also[0].coordinates[0]]
+
+
 def _joint_torque(s: SymbolicSample, body: Body) -> ca.SX:
-    """Return Ia q" + Fv w + Fs sgn w [N m] of a joint: rotor and friction."""
+    """Return Ia q" + Kb w + Fv w + Fs sgn w [N m] of a joint: rotor, back-EMF and friction."""
     k, torque = body.index, ca.SX(0)
     if body.drive is not None:
-        torque += s.by_name[f"Ia{k}"] * s.machine.ratio(body) * s.a[s.row(body)]
+        torque += s.by_name[f"Ia{k}"] * _rotor_acceleration(s, body)
+    if f"Kb{k}" in s.by_name:
+        torque += s.by_name[f"Kb{k}"] * s.rate[body.coordinates[0]]
     if body.friction is not None:
         torque += _friction_torque(s, body)
     return torque
@@ -414,6 +449,9 @@ def _balance(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX, 
     for body in machine.body:
         if body.joint in ("revolute", "prismatic") and machine.is_free(body):
             force[s.row(body)] += machine.ratio(body) * _joint_torque(s, body)
+            if also := machine.turned_with(body):
+                on_other = also[1] * s.by_name[f"Ia{body.index}"] * _rotor_acceleration(s, body)
+                force[s.row(also[0])] += machine.ratio(also[0]) * on_other
             if body.spring is not None:
                 stretch = _spring_torque(s, body)
                 force[s.row(body)] += machine.ratio(body) * stretch

@@ -77,6 +77,20 @@ class KnownValues:
             scipy.linalg.block_diag(self.pull, np.eye(len(std))),
         )
 
+    def with_amounts(self, machine: Machine, names: Sequence[str]) -> KnownValues:
+        """Add what is known of the amounts of effects; names (n_base)."""
+        given = {e.label: e.amount for e in machine.effect if not isinstance(e.amount.known, bool) and e.label in names}
+        if not given:
+            return self
+        std = np.array([float(q.known) for q in given.values()])
+        rows = np.eye(len(names))[[names.index(n) for n in given]] / std[:, None]
+        return KnownValues(
+            np.concatenate([self.rows, rows]),
+            np.concatenate([self.values, np.array([float(q) for q in given.values()]) / std]),
+            (*self.quantities, *(f"effect.{label}" for label in given)),
+            scipy.linalg.block_diag(self.pull, np.eye(len(std))),
+        )
+
     def extended(self, n: int) -> KnownValues:
         """Return the same for n further parameters, of which nothing is known."""
         return KnownValues(np.pad(self.rows, ((0, 0), (0, n))), self.values, self.quantities, self.pull)

@@ -9,6 +9,7 @@ MOMENTS = {"MX": "first moment x", "MY": "first moment y", "MZ": "first moment z
 INERTIA = {"XX": "about x", "YY": "about y", "ZZ": "about the axis", "XY": "xy", "XZ": "xz", "YZ": "yz"}
 ACTING = {
     "Ia": "rotor inertia",
+    "Kb": "damping by back-EMF",
     "Ks": "stiffness of the spring",
     "Ts": "spring torque at zero",
     "Ds": "damping of the spring",

@@ -8,6 +8,7 @@ physics is written once. Effects of the machine file are part of the prediction;
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -19,9 +20,18 @@ from excite.errors import MachineError
 from excite.model import mechanics
 from excite.model.base_parameters import BaseParameters, append_parameters, base_parameters
 from excite.model.effects import GroundMap, PlacedEffect, Site, place_effect
-from excite.model.equations import Equations, contact_lines, edge_slips, equations, kinematics, signed_balance
-from excite.model.known_values import KnownValues, known_values
+from excite.model.equations import (
+    Equations,
+    contact_lines,
+    edge_slips,
+    equations,
+    force_directions,
+    kinematics,
+    signed_balance,
+)
+from excite.model.known_values import KnownValues, known_values, nothing_known
 from excite.model.machine import PER_FORCE_CONSTANT, PER_TORQUE_CONSTANT, Body, Machine, Quantity
+from excite.text import format_number
 
 SCALE_SAMPLES = 400  # random samples from which the default scale is taken; chosen
 USUAL_SPEED = 1.0  # rad/s or m/s, of a joint without a limit; chosen
@@ -56,6 +66,9 @@ def _linear_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
         if body.friction is not None:
             joints[f"Fv{k}"] = (float(body.friction.Fv), "N m s" if turn else "N s/m")
             joints[f"Fs{k}"] = (float(body.friction.Fs), "N m" if turn else "N")
+        back_emf = sum(s.back_emf_damping for s in machine.sensor if s.kind == "torque" and s.body == k)
+        if back_emf:
+            joints[f"Kb{k}"] = (back_emf, "N m s" if turn else "N s/m")
         if body.spring is not None:
             stiffness = float(body.spring.stiffness)
             joints[f"Ks{k}"] = (stiffness, "N m/rad" if turn else "N/m")
@@ -72,10 +85,12 @@ def _linear_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
         return every
     turns = machine.actuated[0].joint == "revolute"
     per_constant = PER_TORQUE_CONSTANT if turns else PER_FORCE_CONSTANT
-    return {
-        name: (value, per_constant.get(unit, f"{unit} A/({'N m' if turns else 'N'})"))
-        for name, (value, unit) in every.items()
-    }
+    own = machine.torque_unit or "A"
+    found = {}
+    for name, (value, unit) in every.items():
+        per_ampere = per_constant.get(unit, f"{unit} A/({'N m' if turns else 'N'})")
+        found[name] = value, re.sub(r"\bA\b", own, per_ampere)
+    return found
 
 
 def encoder_zeros(machine: Machine) -> dict[str, tuple[float, str, float]]:
@@ -95,6 +110,8 @@ def required_signs(machine: Machine) -> dict[str, float]:
             found |= dict.fromkeys((f"Fv{body.index}", f"Fs{body.index}"), 1.0)
         if body.drive is not None:
             found[f"Ia{body.index}"] = 1.0
+        if any(s.back_emf_damping for s in machine.sensor if s.body == body.index):
+            found[f"Kb{body.index}"] = 1.0
         if body.spring is not None:
             found[f"Ks{body.index}"] = 1.0
             if body.spring.damping is not None:
@@ -130,7 +147,8 @@ class Model:
     read: (q, nu, wheels, u, z, X) -> exact readings of the sensors `reading_names`.
     channels: (t, X) -> gain, offset, delay (n_u,) of the torque sensors.
     fit_sensor_effects, fit_shapes: the arguments of `build`.
-    known: what the machine file calls known of the base parameters.
+    known: what the machine file calls known of the base parameters. calibration: the same in SI units of a machine
+        whose values are divided by an unknown torque constant (`in_ratios`), which it gives; nothing is `known` then.
     """
 
     machine: Machine
@@ -158,6 +176,21 @@ class Model:
     fit_sensor_effects: bool
     fit_shapes: bool
     known: KnownValues
+    calibration: KnownValues
+
+    def __repr__(self) -> str:
+        return f"<{self.machine.title}: {len(self.base.names)} base parameters, print it for a table>"
+
+    def __str__(self) -> str:
+        """Table of the base parameters: name, value of the machine file, unit, and what each stands for."""
+        named = zip(self.base.names, self.nominal, self.base.units, strict=True)
+        rows = [("parameter", "value", "unit", "stands for")]
+        for name, value, unit in named:
+            parts = " ".join(f"{factor:+.4g} {part}" for part, factor in self.base.grouping(name).items())
+            rows.append((name, format_number(float(value), 4), unit, parts))
+        widths = [max(len(row[k]) for row in rows) for k in range(3)]
+        lines = [f"{a:<{widths[0]}}  {b:>{widths[1]}}  {c:<{widths[2]}}  {d}" for a, b, c, d in rows]
+        return "\n".join([self.machine.title, *lines])
 
     @property
     def plain(self) -> bool:
@@ -191,8 +224,12 @@ class Model:
 
     @cached_property
     def positive(self) -> np.ndarray:
-        """Mask (n_base,) of parameters that must be above zero: some magnitudes, and unsigned shapes."""
-        above = {e.name for e in self.effects if e.effect.positive}
+        """Mask (n_base,) of parameters that must be above zero: some magnitudes, and unsigned shapes.
+
+        An amount known to a standard deviation is an error of the file, of either sign.
+        """
+        errors = {e.label for e in self.machine.effect if not isinstance(e.amount.known, bool)}
+        above = {e.name for e in self.effects if e.effect.positive} - errors
         above |= {f"{e.name}.{s}" for e in self.effects for s, shape in e.effect.shapes.items() if not shape.signed}
         return np.array([name in above for name in self.base.names])
 
@@ -259,6 +296,11 @@ class Model:
         """(q, nu, a, p, u, z, sign) -> Y (n_q,): `balance` with sgn (n_rubbing,) of the joints' rates given."""
         return signed_balance(self.machine, self.base.standard, self.effects)
 
+    @cached_property
+    def force_directions(self) -> tuple[tuple[tuple[int, str], ...], ca.Function]:
+        """Names (body, kind) of forces that the soil may add to its law, and (q, p) -> unit forces (n_q, n_forces)."""
+        return force_directions(self.machine, self.base.standard)
+
     @property
     def expand(self) -> np.ndarray:
         """The base parameters' `expand` (n_standard, n_base)."""
@@ -299,7 +341,9 @@ class Model:
         The expressions do not show it: a balanced wheel's angle drops out only because cos^2 + sin^2 = 1.
         """
         q, nu, a = self.symbols()
-        p = ca.DM(self.expand @ self.nominal)
+        own = {name for e in self.effects for name in e.parameters}
+        absent = np.array([n in own for n in self.base.names]) & (self.nominal == 0)  # an effect that may yet be there
+        p = ca.DM(self.expand @ np.where(absent, self.scale, self.nominal))
         beside = self.effect_symbols()
         slope = ca.Function("slope", [q, nu, a, *beside], [ca.jacobian(self.predict(q, nu, a, p, *beside), q)])
         rng = np.random.default_rng(0)
@@ -426,6 +470,9 @@ def build(machine: Machine, fit_sensor_effects: bool = True, fit_shapes: bool = 
     stated = np.array([float(machine.scale[s]) if s in machine.scale else np.nan for s in base.names])
     scale = np.where(np.isnan(stated), _default_scale(machine, found, base, nominal, ~np.isnan(stated)), stated)
     known = known_values(machine, base.names, base.matrix, base.standard, nominal, scale)
+    calibration = nothing_known(len(base.names))
+    if machine.in_ratios:
+        known, calibration = calibration, known
     plain, zeros = found, encoder_zeros(machine)
     if placed or zeros:
         magnitudes = _effect_parameters(machine, placed, fit_shapes)
@@ -434,9 +481,12 @@ def build(machine: Machine, fit_sensor_effects: bool = True, fit_shapes: bool = 
             magnitudes = {name: row for name, row in magnitudes.items() if name in shown}
         added = zeros | magnitudes
         base = append_parameters(base, added)
-        known = known.extended(len(added)).with_zeros(machine, base.names)
+        known = known.extended(len(added)).with_zeros(machine, base.names).with_amounts(machine, base.names)
+        calibration = calibration.extended(len(added))
         nominal = np.concatenate([nominal, [v for v, _, _ in added.values()]])
-        scale = np.concatenate([scale, [float(machine.scale.get(n, size)) for n, (_, _, size) in added.items()]])
+        sizes = {e.label: float(e.amount.known) for e in machine.effect if not isinstance(e.amount.known, bool)}
+        sizes = {n: sizes.get(n, float(machine.scale.get(n, size))) for n, (_, _, size) in added.items()}
+        scale = np.concatenate([scale, list(sizes.values())])
         found = equations(machine, base.standard, placed)
     motion = kinematics(plain.sample, plain.slips)
     return Model(
@@ -464,6 +514,7 @@ def build(machine: Machine, fit_sensor_effects: bool = True, fit_shapes: bool = 
         fit_sensor_effects,
         fit_shapes,
         known,
+        calibration,
     )
 
 

@@ -22,26 +22,32 @@ HIDDEN = {
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n != "clean" else ()) for n in GOLDEN])
 def test_golden_log(name: str) -> None:
-    """Values to a thousandth of their deviation: other processors differ in rounding."""
+    """Values of a valid estimate to a hundredth of a deviation: processors and where an iteration ends make so much.
+
+    Values of a doubtful one may end anywhere between what the log and the model say; that they are doubted is held.
+    """
     effects, seed = HIDDEN[name]
     log = excite.simulate("va12_straight", held_straight(), seed=seed, effects=effects)
     if name == "surprise":
         log["theta4_rad"] += 0.004 * np.sin(2 * np.pi * log["t_s"] ** 1.5 / 20)
     want = GOLDEN[name]
     estimate = excite.identify("va12_straight", log)
-    value, std = np.array(list(want["parameters"].values())).T
-    assert list(want["parameters"]) == list(estimate.names)
-    assert (np.abs(estimate.value - value) / std).max() < 1e-3
-    np.testing.assert_allclose(estimate.std, std, rtol=1e-3)
-    assert estimate.cond_phi == pytest.approx(want["cond_phi"], rel=1e-4)
+    assert estimate.status == want["status"]
+    if "parameters" in want:
+        value, std = np.array(list(want["parameters"].values())).T
+        assert list(want["parameters"]) == list(estimate.names)
+        assert (np.abs(estimate.value - value) / std).max() < 0.01
+        np.testing.assert_allclose(estimate.std, std, rtol=1e-3)
+        assert estimate.cond_phi == pytest.approx(want["cond_phi"], rel=1e-3)
     assessment = excite.diagnose("va12_straight", log)
     found = assessment.diagnosis.findings
     assert assessment.diagnosis.verdict == want["verdict"]
-    assert [[f.effect, f.where] for f in found] == [f[:2] for f in want["findings"]]
-    for finding, gain, (_, _, amount, amount_std, percent) in zip(
+    assert len(found) == len(want["findings"])
+    for finding, gain, (effect, where, amount, amount_std, percent) in zip(
         found, assessment.gains, want["findings"], strict=True
     ):
-        assert finding.magnitude == pytest.approx(amount, abs=0.01 * amount_std)
+        assert f"{effect}@{where}" in {f"{finding.effect}@{finding.where}", *finding.tied_with}
+        assert finding.magnitude == pytest.approx(amount, abs=0.05 * amount_std)
         assert finding.magnitude_std == pytest.approx(amount_std, rel=0.01)
         assert gain is not None
-        assert gain.percent == pytest.approx(percent, abs=0.5)
+        assert gain.percent == pytest.approx(percent, abs=2)

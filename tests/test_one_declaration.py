@@ -258,7 +258,11 @@ def test_a_new_method_is_one_function(
     code, shown, err = excite("identify", "va12_straight", one.source, "--method", "halves", "--out", out, "--json")
     assert code == 0, err
     assert json.loads(shown)["method"] == "halves"
-    assert json.loads(shown)["parameters"]["M"]["value"] == methods.identify(straight, [one], "ols").value[0] / 2
+    # half a machine explains no log; tolerances of the file take a part of the blame
+    assert json.loads(shown)["parameters"]["M"]["value"] == methods.identify(straight, [one], "halves").value[0]
+    half = linear_methods.ols(straight, [one], straight.machine.filter).value[0] / 2
+    assert json.loads(shown)["parameters"]["M"]["value"] == pytest.approx(half, rel=0.05)
+    assert json.loads(shown)["status"] == "doubtful"
     for command in ("identify", "verify", "run"):
         offered(excite, command, "method", "halves")
     assert "| halves | Half of what least squares finds. | none | yes |" in reference.choices_page()

@@ -24,7 +24,7 @@ from test_tree import TOLERANCE, Case, relative
 
 from excite.diagnosis import Diagnosis, diagnosis as diagnose, residuals, separating_run
 from excite.errors import InfeasibleError
-from excite.identification import identifiability, methods
+from excite.identification import identifiability, methods, recommend_method
 from excite.logs import inspection, log
 from excite.model import Model, build, standard_parameters
 from excite.model.effects import Site, catalogue, placing, sizes
@@ -253,7 +253,7 @@ def test_a_log_gives_the_true_parameters_back(name: str, model: Model) -> None:
     )
     motion = simulate(model, drive.sample(float(model.machine.sampling_hz)))
     table = sensors.measure(model, motion, kit="full", seed=1)
-    estimate = methods.identify(model, [log.from_table(table, model.machine)], methods.recommend_method(model))
+    estimate = methods.identify(model, [log.from_table(table, model.machine)], recommend_method(model))
     assert estimate.unidentifiable == {}
     z = (estimate.value - model.nominal) / estimate.std
     assert np.abs(z).max() < 4, dict(zip(model.base.names, z.round(1), strict=True))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 from excite import output
-from excite.errors import FolderError
+from excite.errors import DiskError, FolderError
 
 
 def test_a_folder_appears_whole(tmp_path: Path) -> None:
@@ -110,6 +111,12 @@ def test_json_is_strict() -> None:
     }
 
 
+def test_a_folder_of_the_program_s_own_files_is_written_anew(tmp_path: Path) -> None:
+    for name in (output.SUMMARY, "tolerances.csv", "covariance.csv", "machine.json", "budget.png", "report.html"):
+        (tmp_path / name).write_text("{}")
+    output.check_out_folder(tmp_path)
+
+
 @pytest.mark.parametrize("foreign", ["mydata.csv", "thesis.txt", "drive.toml"])
 def test_a_folder_with_anything_else_in_it_is_left_alone(tmp_path: Path, foreign: str) -> None:
     (tmp_path / "o").mkdir()
@@ -128,3 +135,30 @@ def test_what_is_read_is_not_written_over(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.chdir(tmp_path / "o")
     with pytest.raises(FolderError, match="the current folder"):
         output.check_out_folder(Path())
+
+
+@pytest.mark.parametrize("new", [output.new_folder, output.new_file], ids=["folder", "file"])
+def test_a_full_disk_is_one_line(new: Any, tmp_path: Path) -> None:
+    full = Path("/dev/full")
+    if not full.exists():
+        pytest.skip("no /dev/full here")
+    with pytest.raises(DiskError, match=r"made: could not be written: No space left on device"), new(tmp_path / "made"):
+        full.write_text("x")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_too_large_a_file_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(DiskError, match=r"made: could not be written: File too large"):
+        _write_with_a_limit(tmp_path / "made")
+    assert list(tmp_path.iterdir()) == []
+
+
+def _write_with_a_limit(out: Path) -> None:
+    """Write a file beyond a limit of the size of files."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with output.new_file(out) as part:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+        try:
+            part.write_bytes(bytes(200_000))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,19 +10,13 @@ from typing import Any
 
 from excite import output, workflows
 from excite.app.job import Job
+from excite.app.results import Result, is_readable_file, read_result, read_stored
 from excite.errors import MachineError
 from excite.model.machine import MACHINES, Machine, load_machine, machine_files, shipped_machines
 
+MOST_PASSED_OVER = 20  # lines about what no step can show
+MAX_NAME = 60  # letters of a result's name: of four bytes each they fit into a file name
 STATE = "app.json"  # choices of the day that no result holds
-# a key that only summaries of that kind have
-KINDS = {
-    "machine": "coordinates",
-    "design": "cond_phi_start",
-    "drive": "phases",
-    "log": "columns",
-    "identify": "unidentifiable",
-    "diagnose": "findings",
-}
 STEPS = {
     "machine": "Machine",
     "design": "Design",
@@ -34,16 +27,6 @@ STEPS = {
 }
 LOG_ENDINGS = (".csv", ".txt", ".parquet", ".mat", ".mf4", ".xlsx", ".h5", ".hdf5", ".bag", ".mcap", ".blf", ".asc")
 PROFILE_FILES = ("profile.csv", "phases.csv", "covariance.csv", "prediction.csv")  # tables that are no logs
-
-
-@dataclass(frozen=True)
-class Result:
-    """A result folder: its kind, summary and time [s since 1970]."""
-
-    kind: str
-    folder: Path
-    summary: dict[str, Any]
-    time: float
 
 
 @dataclass(frozen=True)
@@ -87,7 +70,8 @@ class Day:
         }
         self.job: Job | None = None
         self._seen: list[Result] | None = None
-        self._read: dict[Path, tuple[int, Result | None]] = {}
+        self._read: dict[Path, tuple[int, Result | str | None]] = {}
+        self.passed_over: list[str] = []  # what the folder holds and no step can show, a line each
         self._loaded: dict[str, tuple[tuple[int, ...], list[Path], Machine | MachineError]] = {}
         self._fresh: set[str] = set()  # machines whose files were looked at in this glance
         self._restore()
@@ -96,18 +80,14 @@ class Day:
 
     def _restore(self) -> None:
         """Take up the choices of before; without any, those of the newest results."""
-        try:
-            said = json.loads((self.folder / STATE).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            said = {}
-        if not isinstance(said, dict):
-            said = {}
+        said = read_stored(self.folder / STATE)
         for name, form in self.forms.items():
-            kept = said.get("forms", {}).get(name, {})
-            form.update({key: kept[key] for key in form if key in kept})
-        self.accepted |= said.get("accepted", {})
-        self.logs = [str(path) for path in said.get("logs", ()) if Path(path).exists()]
-        self.machine = said.get("machine") if said.get("machine") in self.machines() else self._machine_of_results()
+            kept = said.forms.get(name, {})
+            form.update({key: kept[key] for key in form if key in kept and _alike(form[key], kept[key])})
+        if {"words", "doubts"} <= set(said.accepted):
+            self.accepted = dict(said.accepted)
+        self.logs = [path for path in said.logs if is_readable_file(path)]
+        self.machine = said.machine if said.machine in self.machines() else self._machine_of_results()
         if not self.logs:
             self.logs = self._logs_of_results()
 
@@ -126,7 +106,7 @@ class Day:
         for result in self.results("log", "identify", "diagnose"):
             used = [result.summary["log"]] if result.kind == "log" else result.summary["logs"]
             used = list(dict.fromkeys(str(path).partition(" from row ")[0] for path in used))
-            if self._is_machine(result.summary.get("machine")) and all(Path(path).exists() for path in used):
+            if self._is_machine(result.summary.get("machine")) and all(map(is_readable_file, used)):
                 return used
         return []
 
@@ -146,24 +126,27 @@ class Day:
             self._fresh.clear()
 
     def _scan(self) -> list[Result]:
-        found = []
+        found, odd = [], list[str]()
         for path in (*self.folder.glob(f"*/{output.SUMMARY}"), *self.folder.glob(f"*/*/{output.SUMMARY}")):
             if not path.parent.name.startswith(".") and not path.parents[1].name.startswith("."):
                 result = self._result(path)
-                if result is not None:
+                if isinstance(result, Result):
                     found.append(result)
+                elif result is not None:
+                    odd.append(result)
+        for path in sorted(self.folder.glob("*")):
+            if path.suffix.lower() in (*LOG_ENDINGS, ".toml") and not path.is_file():
+                odd.append(f"{path}: is no file")
+        self.passed_over = sorted(odd)[:MOST_PASSED_OVER]
         return sorted(found, key=lambda r: (-r.time, str(r.folder)))
 
-    def _result(self, path: Path) -> Result | None:
+    def _result(self, path: Path) -> Result | str | None:
         try:
             stamp = path.stat().st_mtime_ns
-            if self._read.get(path, (None,))[0] != stamp:
-                summary = json.loads(path.read_text(encoding="utf-8"))
-                keys = summary if isinstance(summary, dict) else {}
-                kind = next((kind for kind, key in KINDS.items() if key in keys), None)
-                self._read[path] = (stamp, Result(kind, path.parent, summary, stamp / 1e9) if kind else None)
-        except (OSError, ValueError):
-            return None
+        except OSError as err:
+            return f"{path}: can't be read: {err.strerror}"
+        if self._read.get(path, (None,))[0] != stamp:
+            self._read[path] = (stamp, read_result(path.parent, stamp / 1e9))
         return self._read[path][1]
 
     # -------------------------------------------------------------------------------------------- machine and logs
@@ -223,8 +206,8 @@ class Day:
 
     def known_logs(self) -> list[str]:
         """Return the logs to choose from: those in the folder, checked before, or chosen."""
-        there = [str(p) for p in sorted(self.folder.glob("*")) if p.suffix.lower() in LOG_ENDINGS]
-        checked = [r.summary["log"] for r in self.results("log") if Path(r.summary["log"]).exists()]
+        there = [str(p) for p in sorted(self.folder.glob("*")) if p.suffix.lower() in LOG_ENDINGS and p.is_file()]
+        checked = [r.summary["log"] for r in self.results("log") if is_readable_file(r.summary["log"])]
         return sorted(path for path in {*self.logs, *there, *checked} if Path(path).name not in PROFILE_FILES)
 
     # -------------------------------------------------------------------------------------------- results that count
@@ -367,7 +350,7 @@ class Day:
         assert self.machine is not None
         given = str(self.forms[step].get("out") or "").strip()
         if given:
-            return self.folder / Path(given).name
+            return self.folder / Path(given.replace("\0", "")).name[:MAX_NAME]
         plain = self.folder / f"{step}-{workflows.machine_stem(self.machine)}"
         if step != "design":
             return plain
@@ -378,7 +361,15 @@ class Day:
         """Return the arguments of a step's command. log: of the log step, the log to check."""
         assert self.machine is not None
         if step == "log":
-            return ["log", "check", log, "--machine", self.machine, "--out", str(self.folder / f"log-{Path(log).stem}")]
+            return [
+                "log",
+                "check",
+                log,
+                "--machine",
+                self.machine,
+                "--out",
+                str(self.folder / f"log-{Path(log).stem[:MAX_NAME]}"),
+            ]
         form, out = self.forms[step], ["--out", str(self.out(step))]
         if step == "machine":
             return ["machine", "check", str(self.machine_path()), *out]
@@ -438,6 +429,14 @@ def _flags(form: dict[str, Any], *names: str) -> list[str]:
     return [f"--{name}" for name in names if form.get(name)]
 
 
+def _alike(usual: Any, kept: Any) -> bool:
+    """True if a field may hold what was kept: a value of its usual type, or nothing."""
+    number = isinstance(kept, int | float) and not isinstance(kept, bool)
+    if usual is None:
+        return kept is None or number or isinstance(kept, str)
+    return number if isinstance(usual, int) and not isinstance(usual, bool) else isinstance(kept, type(usual))
+
+
 def _same(one: str | Path, other: str | Path) -> bool:
     return Path(one).resolve() == Path(other).resolve()
 
@@ -445,7 +444,7 @@ def _same(one: str | Path, other: str | Path) -> bool:
 def _is_machine_file(path: Path) -> bool:
     """Return True for a TOML file that describes a machine, however wrong."""
     try:
-        text = path.read_text(encoding="utf-8", errors="replace")
+        text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
     except OSError:
         return False
     return "[[body]]" in text or text.startswith("extends") or "\nextends" in text

@@ -13,6 +13,7 @@ from excite.app.day import Day
 from excite.app.fields import Page
 from excite.app.job import Job
 from excite.app.key_lines import find_line
+from excite.app.results import is_readable_file
 from excite.model.machine import shipped_machines
 
 # Places each message at its line, below the one before; again whenever the size of the page changes.
@@ -90,11 +91,11 @@ def _choose(day: Day, page: Page, machine: str) -> None:
 
 def _take(day: Day, page: Page) -> None:
     path = Path(day.forms["machine"]["path"].strip())
-    if path.suffix == ".toml" and path.is_file():
+    if path.suffix == ".toml" and is_readable_file(path):
         day.choose(str(path))
         day.forms["machine"]["path"] = ""
     else:
-        ui.notify(f"{path}: is no .toml file that is there", type="negative")
+        ui.notify(f"{str(path)[:200]}: is no .toml file that is there", type="negative")
     page.tick()
 
 

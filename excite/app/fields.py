@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Protocol
 
 from nicegui import ui
 
 from excite import workflows
-from excite.app.day import Day, Result
+from excite.app.day import Day
 from excite.app.job import Job
+from excite.app.results import Result, is_readable_file
 
 UPLOAD = """async (event) => {
   const file = event.target.files[0];
@@ -113,8 +113,8 @@ def log(day: Day, page: Page) -> None:
 
     def add(path: str) -> None:
         path = path.strip()
-        if not Path(path).is_file():
-            note.text = f"{path or 'no path'}: no such file"
+        if not is_readable_file(path):
+            note.text = f"{path[:200] or 'no path'}: no such file"
             return
         day.logs = [path] if path not in day.logs else day.logs
         form["path"] = ""

@@ -37,18 +37,23 @@ class Job:
         self.code: int | None = None
         self.message = ""
         self.stops = 0
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "excite", *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            encoding="utf-8",
-            errors="replace",
-            env={**os.environ, PROGRESS_VARIABLE: "json"},
-            start_new_session=True,  # a Ctrl-C in the terminal of the window is passed on by `stop`
-        )
-        self._thread = threading.Thread(target=self._follow, daemon=True)
+        self._process: subprocess.Popen[str] | None = None
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "excite", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                encoding="utf-8",
+                errors="replace",
+                env={**os.environ, PROGRESS_VARIABLE: "json"},
+                start_new_session=True,  # a Ctrl-C in the terminal of the window is passed on by `stop`
+            )
+        except (OSError, ValueError) as err:  # no memory, or a text that no command line can hold
+            self.code, self.message = 2, f"the command can't be started: {err}"
+            return
+        self._thread = threading.Thread(target=self._follow, args=(self._process,), daemon=True)
         self._thread.start()
 
     @property
@@ -63,18 +68,21 @@ class Job:
     def stop(self) -> None:
         """Ask the command to stop, as Ctrl-C does: what it has so far it may keep. The second time, end it."""
         self.stops += 1
+        if self._process is None:
+            return
         with suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGINT if self.stops == 1 else signal.SIGKILL)
 
     def wait(self, seconds: float) -> bool:
         """Wait until it has ended; return whether it has."""
-        self._thread.join(seconds)
+        if self._process is not None:
+            self._thread.join(seconds)
         return not self.running
 
-    def _follow(self) -> None:
-        assert self._process.stderr is not None
+    def _follow(self, process: subprocess.Popen[str]) -> None:
+        assert process.stderr is not None
         last, defect = "", False
-        for line in self._process.stderr:
+        for line in process.stderr:
             try:
                 said = json.loads(line)
                 self.label, self.done, self.total, self.best = (said[k] for k in ("label", "done", "total", "best"))
@@ -82,7 +90,7 @@ class Job:
             except (ValueError, TypeError, KeyError):
                 last = line.strip() or last
                 defect = defect or line.startswith("Traceback")
-        code = self._process.wait()
+        code = process.wait()
         self.seconds = time.monotonic() - self.begin
         if self.stops > 1:
             output.remove_partial_folders(self.out)

@@ -14,8 +14,9 @@ from nicegui import ui
 
 from excite import output, reports, trajectories
 from excite.app import editor, fields
-from excite.app.day import STEPS, Day, Result
+from excite.app.day import STEPS, Day
 from excite.app.job import Job, command_line
+from excite.app.results import Result
 from excite.reports import Description, Table
 from excite.text import format_number
 
@@ -79,6 +80,7 @@ class Window:
                 self.form = ui.element("section").props('aria-label="Settings"')
                 self._action_row()
                 self.result = ui.element("section").classes("result").props('aria-label="Result"')
+                self.passed = ui.element("ul").classes("needs").props('aria-label="In the folder, but not shown"')
         ui.skip_link("Skip to the step", target=main)
         self.show(self.step)
         ui.timer(TICK_S, self.tick)
@@ -148,6 +150,7 @@ class Window:
             self._changed("needs", needs, self.needs, partial(self._needs, needs))
             self._changed("form", self._form_key(), self.form, self._form)
             self._action_now()
+            self._changed("passed", day.passed_over, self.passed, partial(self._passed_over, day.passed_over))
             results = self._results()
             key = [(r.folder, r.time, day.outdated(r)) for r in results], self._compare_key()
             self._changed("result", key, self.result, partial(self._result, results))
@@ -235,6 +238,11 @@ class Window:
             case _:
                 return day.machine, day.doubts(), day.accepted_words()
 
+    def _passed_over(self, lines: list[str]) -> None:
+        for line in lines:
+            with ui.element("li"):
+                ui.label(f"{line}; it is not shown").classes("hint")
+
     def _form(self) -> None:
         {
             "machine": editor.build,
@@ -296,6 +304,7 @@ class Window:
                 ui.label(caption)
 
     def _comparison(self, results: list[Result]) -> None:
+        results = [r for r in results if r.summary["worst_percent"] is not None]
         if len(results) < 2:
             ui.label("Needs two designs of this machine: step Design makes another, under a name of its own.")
             return
@@ -354,7 +363,7 @@ def _accuracy(names: list[str], one: dict[str, Any], other: dict[str, Any]) -> T
     rows = tuple(
         (name, format_number(a[name], 2), format_number(b[name], 2), format_number(b[name] / a[name], 2))
         for name in a
-        if name in b
+        if a[name] and b.get(name) is not None
     )
     marked = tuple(k for k, row in enumerate(rows) if row[0] in (one["worst_parameter"], other["worst_parameter"]))
     columns = ("parameter", f"{names[0]} [%]", f"{names[1]} [%]", "second / first")

@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import os
 import secrets
 import socket
 import sys
+import tempfile
 import threading
 import webbrowser
 from collections.abc import Awaitable, Callable, MutableMapping
@@ -16,7 +18,8 @@ from typing import Any
 from urllib.parse import quote
 
 from excite import output
-from excite.app.day import Day
+from excite.app.day import LOG_ENDINGS, Day
+from excite.app.results import is_possible_name
 from excite.errors import FolderError, ServeError, UsageError
 
 HOST = "127.0.0.1"
@@ -91,6 +94,7 @@ def web_app(day: Day) -> Any:
     from fastapi import FastAPI
     from fastapi.responses import FileResponse, PlainTextResponse
     from nicegui import ui
+    from starlette.requests import ClientDisconnect
 
     from excite.app.page import Window
 
@@ -98,8 +102,12 @@ def web_app(day: Day) -> Any:
 
     @web.get("/files/{path:path}")
     def file(path: str) -> Any:
-        found = (day.folder / path).resolve()
-        if not found.is_relative_to(day.folder.resolve()) or not found.is_file():
+        try:
+            found = (day.folder / path).resolve()
+            there = found.is_relative_to(day.folder.resolve()) and found.is_file()
+        except (OSError, ValueError):  # a name that no file can have, a loop of links
+            there = False
+        if not there:
             return PlainTextResponse("no such file\n", 404)
         policy = {} if found.suffix == ".pdf" else {"Content-Security-Policy": FILE_POLICY}  # a viewer needs no sandbox
         return FileResponse(found, headers={"Cache-Control": "no-cache", **policy})
@@ -107,22 +115,31 @@ def web_app(day: Day) -> Any:
     async def log(request: Any) -> Any:
         name = Path(request.path_params["name"].replace("\\", "/")).name
         path = day.folder / name
-        if not name or name.startswith(".") or path.suffix in (".toml", ".json", ".html"):
-            return PlainTextResponse(f"{name}: is no name for a log", 400)
+        if path.suffix.lower() not in LOG_ENDINGS or name.startswith(".") or not is_possible_name(name):
+            said = f"{name[:60]}: is no name for a log, which ends in {', '.join(LOG_ENDINGS)}"
+            return PlainTextResponse(said, 400)
+        taken = f"{path}: exists already; rename the log, or choose it in the list"
         if path.exists():
-            return PlainTextResponse(f"{path}: exists already; rename the log, or choose it in the list", 409)
+            return PlainTextResponse(taken, 409)
         size = 0
         try:
-            with output.new_file(path) as place, place.open("wb") as file:
+            with output.new_file(path, replace=False) as place, place.open("wb") as file:
                 async for chunk in request.stream():
                     size += len(chunk)
                     if size > MAX_LOG_BYTES:
                         raise UsageError(f"{name}: is larger than {MAX_LOG_BYTES / 1e9:g} GB; put it into {day.folder}")
                     file.write(chunk)
-        except (UsageError, OSError) as err:
-            return PlainTextResponse(str(err), 400)
+        except FileExistsError:
+            return PlainTextResponse(taken, 409)
+        except ClientDisconnect:
+            return PlainTextResponse(f"{name}: came in part only", 400)
+        except (UsageError, FolderError, OSError) as err:
+            return PlainTextResponse(f"{name}: {err}" if isinstance(err, OSError) else str(err), 400)
         day.logs = [str(path)]
-        day.save()
+        try:
+            day.save()
+        except (FolderError, OSError) as err:
+            return PlainTextResponse(f"{path} is there, but the choices of the day can't be stored: {err}", 400)
         return PlainTextResponse(str(path))
 
     web.add_route("/log/{name}", log, methods=["POST"])
@@ -143,8 +160,24 @@ ICON = (
 )
 
 
+def _redirect(folder: Path, address: str) -> Path:
+    """Write a page that only this user can read and that leads to the address, and return its file.
+
+    The browser gets the file's name: its command line, which every user of the computer can list, holds no key.
+    Raises FolderError.
+    """
+    try:
+        handle, name = tempfile.mkstemp(prefix=".excite-", suffix=".html", dir=folder)
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(f'<!doctype html><meta http-equiv="refresh" content="0; url={address}"><title>excite</title>\n')
+    except OSError as err:
+        raise FolderError(f"{folder}: can't be written, {err.strerror}") from None
+    return Path(name)
+
+
 def serve(folder: Path, port: int, browser: bool, ready: Callable[[str], None]) -> None:
-    """Serve the window of a folder until Ctrl-C; `ready` gets its address, which a browser opens if wanted.
+    """Serve the window of a folder until Ctrl-C; `ready` gets its address, which a browser opens if wanted, through a
+    file that only this user can read.
 
     port: 0 for any free one. A command that runs at the end is stopped, as its own Stop does.
     Raises ServeError if the port is taken, FolderError if the folder can't be written, ModuleNotFoundError without
@@ -171,14 +204,17 @@ def serve(folder: Path, port: int, browser: bool, ready: Callable[[str], None]) 
         Gate(web_app(day), token, port), log_level="error", access_log=False, timeout_graceful_shutdown=1
     )
     ready(address)
-    if browser:
-        threading.Timer(0.5, webbrowser.open, (address,)).start()
+    door = _redirect(folder, address) if browser else None
+    if door is not None:
+        threading.Timer(0.5, webbrowser.open, (door.resolve().as_uri(),)).start()
     try:
         asyncio.run(uvicorn.Server(settings).serve([taken]))
     except KeyboardInterrupt:
         pass
     finally:
         taken.close()
+        if door is not None:
+            door.unlink(missing_ok=True)
         if day.running and day.job is not None:
             sys.stderr.write("stopping what runs\n")
             day.job.stop()

@@ -162,6 +162,36 @@ def verify(
         summary |= workflows.verify(place, design_dir, runs, method, kit, seed, bar=terminal.bar)
 
 
+@commands.command()
+def handover(
+    design_dir: DesignArgument,
+    rate: Annotated[float | None, typer.Option("--rate", help="rows a second in the files [125]")] = None,
+    slower: Annotated[
+        float, typer.Option("--slower", help="how many times as slow the motion is, for a rehearsal on the machine")
+    ] = 1.0,
+    joints: Annotated[
+        str | None,
+        typer.Option("--joints", help="names of the joints for ROS, with commas between [those of the machine file]"),
+    ] = None,
+    bag: Annotated[bool, typer.Option("--bag", help="write a ROS 2 bag as well")] = False,
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Write an arm's designed motion for its controller.
+
+    A table at any rate, a JointTrajectory of ROS 2, for arms of six axes programs in URScript, KRL and RAPID, and a
+    rehearsal that says in words what will move where.
+
+    Example: excite handover results/design-ur10 --slower 10
+    """
+    from excite import trajectories
+
+    name = trajectories.read_design_summary(design_dir)["machine"]
+    out = out or Path(f"results/handover-{name}")
+    with result_folder(out, json, partial(terminal.show, "handover"), [design_dir]) as (place, summary):
+        summary |= workflows.hand_over(place, design_dir, rate, slower, joints, bag)
+
+
 @commands.command(cls=DrawingCommand)
 def compare(
     machine: MachineArgument,

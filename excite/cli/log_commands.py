@@ -22,6 +22,7 @@ from excite.cli.options import (
     OutOption,
 )
 from excite.errors import UsageError
+from excite.logs import ENDINGS
 from excite.text import count, format_number
 
 commands = typer.Typer()
@@ -161,7 +162,7 @@ def diagnose(
 def slip(
     table: Annotated[
         Path | None,
-        typer.Argument(metavar="[TABLE]", help="forces of a wheel at some slips (.csv, .xlsx, .mat, .parquet, ...)"),
+        typer.Argument(metavar="[TABLE]", help=f"forces of a wheel at some slips ({ENDINGS})"),
     ] = None,
     column: Annotated[
         list[str] | None,
@@ -251,7 +252,7 @@ logs = typer.Typer(help="Check or convert a log.", rich_markup_mode=None)
 
 @logs.command("check", cls=DrawingCommand)
 def check_log(
-    path: Annotated[Path, typer.Argument(metavar="FILE", help="a log (.csv, .txt, .parquet, .mat, .mf4)")],
+    path: Annotated[Path, typer.Argument(metavar="FILE", help=f"a log ({ENDINGS})")],
     machine: Annotated[
         str | None, typer.Option("--machine", help="machine of the log; guessed from its columns by default")
     ] = None,

@@ -92,11 +92,13 @@ def new_machine(
     if like is not None and origin is not None:
         raise UsageError("--from: writes a whole file, --like one that extends another: leave one out")
     out = out or Path(f"{name}.toml")
-    machine_template.start(name, out, like, origin)
+    notes = machine_template.start(name, out, like, origin)
     if json:
-        terminal.show_json({"machine": name, "file": str(out)})
-    else:
-        terminal.say(f"{out}: change what differs, then `excite machine check {out}`")
+        terminal.show_json({"machine": name, "file": str(out), "notes": list(notes)})
+        return
+    terminal.say(f"{out}: change what differs, then `excite machine check {out}`")
+    for line in notes:
+        terminal.say(f"- {line}")
 
 
 @machine_files.command("urdf")
@@ -130,6 +132,41 @@ def write_urdf(
         terminal.say(f"- {line}")
 
 
+@machine_files.command("model")
+def write_model(
+    result: Annotated[Path, typer.Argument(metavar="RESULT", help="folder that `excite identify` wrote")],
+    out: Annotated[Path, typer.Option("--out", help="file to write: .urdf, .xml for MuJoCo, .fmu for FMI 3")],
+    json: JsonOption = False,
+) -> None:
+    """Write an arm with its identified parameters for other engines: URDF, MJCF of MuJoCo, FMI 3.
+
+    Of all physically possible bodies with the identified parameters, the nearest to the machine file's are written,
+    with friction, in MJCF rotors and springs too. `machine urdf` changes the URDF that a machine file is from instead.
+
+    Example: excite machine model results/identify-ur10 --out ur10.xml
+    """
+    from excite import identification, output
+
+    if out.suffix not in workflows.MODEL_WRITERS:
+        raise UsageError(
+            f"--out {out}: ends in {out.suffix or 'nothing'}, allowed: {', '.join(workflows.MODEL_WRITERS)}"
+        )
+    saved = identification.read_estimate(result)
+    if saved.estimate.status == "invalid":
+        raise UsageError(f"{result}: holds no estimate: {saved.estimate.doubt}")
+    standard, far = identification.possible_standard(saved.model, saved.estimate)
+    made, notes = workflows.MODEL_WRITERS[out.suffix](saved.model.machine, standard)
+    notes = [*notes, *([] if far is None else [far])]
+    with output.new_file(out) as part:
+        part.write_bytes(made if isinstance(made, bytes) else made.encode())
+    if json:
+        terminal.show_json({"machine": saved.model.machine.name, "file": str(out), "notes": notes})
+        return
+    terminal.say(f"{out}: {count(len(saved.model.machine.body), 'body', 'bodies')} with identified parameters")
+    for line in notes:
+        terminal.say(f"- {line}")
+
+
 @machine_files.command("check", cls=DrawingCommand)
 def check_machine(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="a machine file (.toml)")],
@@ -137,6 +174,9 @@ def check_machine(
     json: JsonOption = False,
 ) -> None:
     """Check a machine file: everything that is wrong or doubtful, and a drawing from above.
+
+    Of a usable one the folder also holds wiring.csv, for the person who wires the logger (columns, units, rates, signs,
+    clocks), and log_template.csv, an empty log.
 
     All faults at once, each with its line, name and key, and what was probably meant; values that look like those of
     another unit are doubtful. Ends with exit code 2 if anything is wrong.

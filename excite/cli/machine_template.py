@@ -17,19 +17,24 @@ from excite.model.machine import Machine
 TEMPLATE = "machine.toml"
 
 
-def start(name: str, file: Path, like: str | None = None, origin: str | None = None) -> None:
+def start(name: str, file: Path, like: str | None = None, origin: str | None = None) -> tuple[str, ...]:
     """Write the template, all of `origin` (a shipped machine or a URDF), or what extends `like` with columns to change.
 
-    Raises MachineError for an existing file, an impossible name, or a URDF that can't be expressed.
+    Returns notes on a URDF that is read otherwise than it is written. Raises MachineError for an existing file, an
+    impossible name, or a URDF that can't be expressed.
     """
-    if origin is not None:
-        text = from_urdf(name, file, Path(origin)) if is_urdf(origin) else whole(name, file, origin)
+    notes: tuple[str, ...] = ()
+    if origin is not None and is_urdf(origin):
+        text, notes = from_urdf(name, file, Path(origin))
+    elif origin is not None:
+        text = whole(name, file, origin)
     else:
         text = fresh(name, file) if like is None else renamed(name, file, machine.load_machine(like))
     if file.exists():
         raise MachineError(f"{file}: exists already, give another --out")
     with output.new_file(file) as place:
-        place.write_text(text, encoding="utf-8")
+        place.write_text(text, encoding="utf-8", errors="replace")
+    return notes
 
 
 def fresh(name: str, file: Path) -> str:
@@ -61,17 +66,22 @@ def is_urdf(origin: str) -> bool:
     return Path(origin).suffix.lower() in (".urdf", ".xml")
 
 
-def from_urdf(name: str, file: Path, origin: Path) -> str:
-    """Return the file of a robot described in URDF, each key with unit and meaning. Raises MachineError."""
+def from_urdf(name: str, file: Path, origin: Path) -> tuple[str, tuple[str, ...]]:
+    """Return the file of a robot described in URDF, each key with unit and meaning, and notes. Raises MachineError."""
     _named(name)
+    tables, notes = workflows.machine_from_urdf(origin, name)
+    missing = workflows.add_shapes(origin, tables)
+    if missing is not None:
+        notes = (*notes, f"Collisions won't be looked at: {missing}.")
     lines = [
         f"# {name}: the robot of {origin.name}, its base fixed, z up. Frames are those of modified Denavit-Hartenberg,",
         "# z along each joint's axis; coordinates are those of the URDF, and `published` values are its own. Columns,",
         "# sampling, filter and what is `assumed` must be changed to yours.",
         f"# Then run `excite machine check {file}`. Everything is SI: m, kg, s, N, N m, rad.",
-        "",
+        *(f"# {note}" for note in notes),
     ]
-    return "\n".join([*lines, *_with_meanings(name, _dumped(workflows.machine_from_urdf(origin, name)))]) + "\n"
+    head = [" ".join(line.split()) for line in lines]
+    return "\n".join([*head, "", *_with_meanings(name, _dumped(tables))]) + "\n", notes
 
 
 def _with_meanings(name: str, text: str) -> list[str]:
@@ -89,7 +99,7 @@ def _with_meanings(name: str, text: str) -> list[str]:
         open_list += 0 if line.lstrip().startswith("#") else line.count("[") - line.count("]")
         if key and not header_of and key[1] == "name":
             line = f'name = "{name}"'
-        lines.append(line if open_list else _explained(line, says))
+        lines.append(_explained(line, says))
     return lines
 
 
@@ -106,6 +116,12 @@ RECORDS = {  # of the tables of a machine file, by their headers
     "body.spring": "Spring",
     "body.contact": "Contact",
     "body.limit": "JointLimit",
+    "body.shape": "Shape",
+    "world": "World",
+    "world.shape": "Shape",
+    "world.plane": "Plane",
+    "world.box": "Box",
+    "tool": "Tool",
     "sensor": "Sensor",
     "sensor.loop": "ForceLoop",
     "filter": "Filter",
@@ -155,6 +171,7 @@ def renamed(name: str, file: Path, like: Machine) -> str:
         "",
         f'extends = "{like.name}"',
         f'name = "{name}"',
+        'noise_unit = "SI"',
         f"sampling_hz = {_toml(like.sampling_hz.model_dump(exclude_defaults=True))} # of the logs",
         f'time_column = "{like.time_column}"',
         f'time_unit = "{like.time_unit}"',
@@ -171,7 +188,7 @@ def _toml(value: Any) -> str:
         return "{ " + ", ".join(f"{key} = {_toml(inner)}" for key, inner in value.items()) + " }"
     if isinstance(value, list):
         return "[" + ", ".join(_toml(inner) for inner in value) + "]"
-    return json.dumps(value, ensure_ascii=False)
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _named(name: str) -> None:

@@ -10,6 +10,7 @@ import typer
 import typer.core
 
 from excite import workflows
+from excite.logs import ENDINGS
 
 
 def machine_names(incomplete: str) -> list[str]:
@@ -94,9 +95,7 @@ MachineArgument = Annotated[
     ),
 ]
 DesignArgument = Annotated[Path, typer.Argument(metavar="DESIGN_DIR", help="folder that `excite design` wrote")]
-LogsArgument = Annotated[
-    list[Path], typer.Argument(metavar="LOG...", help="one log or several (.csv, .txt, .parquet, .mat, .mf4)")
-]
+LogsArgument = Annotated[list[Path], typer.Argument(metavar="LOG...", help=f"one log or several ({ENDINGS})")]
 OutOption = Annotated[Path | None, typer.Option("--out", help="folder to write [results/<command>-<machine>]")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print the summary as JSON and nothing else")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="seed of random numbers: same seed, same result")]

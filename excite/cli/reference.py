@@ -1,4 +1,4 @@
-"""Reference pages made from the code: effects, machine file, units, choices, study file, commands, Python interface."""
+"""Reference pages made from the code: effects, machine file, choices, log files, commands, Python interface."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from pydantic import AfterValidator
 import excite
 from excite import identification, simulation, trajectories, workflows
 from excite.cli import reference_html
+from excite.logs import FORMATS
 from excite.model import effects
 from excite.model.effects import DEFAULT_DURATION, Effect, Shape, Site, unit_size
 from excite.model.machine import MEANINGS, UNITS, FileRecord, Machine, load_machine, shipped_machines
@@ -257,7 +258,7 @@ def choices_page() -> str:
         ),
         "## Methods",
         "",
-        "Methods of identification: `--method`; by default `joint` if slips are measured, `wls` otherwise.",
+        "Methods of identification: `--method`; by default `inverse` if every joint is driven, `joint` otherwise.",
         "",
         *_table(
             "method | what it does | effects that it estimates | needs the lateral speed",
@@ -372,10 +373,32 @@ def _sentence(text: str) -> str:
     return first + ("" if text.endswith(".") else ".")
 
 
+# ------------------------------------------------------------------------------------------------ log files
+
+
+def log_files_page() -> str:
+    """Write the page of the formats of log files: endings, names of columns, extra to install."""
+    rows = (
+        (f.kind, ", ".join(f"`{s}`" for s in f.suffixes), f.columns, f"`{f.extra}`" if f.extra else "-")
+        for f in FORMATS
+    )
+    return _page(
+        "# Log files",
+        "",
+        "Formats that every command reads; an extra is installed by `pip install 'excite[EXTRA]'`. The folder of a bag",
+        "of ROS 2 is given as it is. Text may have any usual separator, decimal commas, comments and lines of units.",
+        "",
+        *_table("format | endings | columns are named | extra", rows),
+        "Columns that share a name are told apart by position: `u`, `u.1`; elements of a list in a cell are `q[0]`,",
+        "`q[1]`.",
+    )
+
+
 PAGES: dict[str, Callable[[], str]] = {
     "machine-file.md": machine_page,
     "study-file.md": study_page,
     "choices.md": choices_page,
     "effects.md": effects_page,
     "python.md": python_page,
+    "log-files.md": log_files_page,
 }

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from excite import reports, workflows
+from excite.text import format_number
 
 LINE_INTERVAL_S = 30.0  # between lines of progress where there is no terminal; chosen
 INTERRUPTED = 130  # exit code of Ctrl-C, as shells have it
@@ -99,7 +100,7 @@ def bar(label: str) -> Iterator[Advance]:
 
         def write(done: int, total: int, note: float | str | None) -> None:
             best = note if note is not None and not isinstance(note, str) and math.isfinite(note) else None
-            doing = note if isinstance(note, str) else None
+            doing = note if isinstance(note, str) else getattr(note, "doing", None)
             said = {"label": label, "done": done, "total": total, "best": best, "doing": doing}
             sys.stderr.write(f"{json.dumps(said)}\n")
             sys.stderr.flush()
@@ -119,8 +120,9 @@ def bar(label: str) -> Iterator[Advance]:
             text = label
             if isinstance(note, str):
                 text = f"{label}: {note}"
-            elif note is not None and math.isfinite(note):
-                text = f"{label}, best so far {note:.2f}"
+            elif note is not None:
+                best = f", best so far {format_number(note, 4)}" if math.isfinite(note) else ""
+                text = f"{label}{best}: {doing}" if (doing := getattr(note, "doing", "")) else f"{label}{best}"
             progress.update(task, completed=done, total=total, description=text)
 
         yield advance

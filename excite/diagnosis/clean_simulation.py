@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from excite import identification
-from excite.diagnosis.fits import ExtendedFit
+from excite.diagnosis.fits import RESUMED_DAMPING, RESUMED_PASSES, ExtendedFit
 from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.residuals import concentrations, residuals_of_logs
 from excite.errors import SimulationError
@@ -21,9 +21,8 @@ from excite.logs import Log
 from excite.simulation import Motion
 from excite.smoothing import (
     ACCEPTABLE_STEP,
-    RESUMED_DAMPING,
     Fit,
-    NotConvergedError,
+    Settings,
     StateSpace,
     Trajectory,
     fit_logs,
@@ -117,21 +116,12 @@ def _clean_squares(stage: ExtendedFit, seed: int) -> tuple[np.ndarray, np.ndarra
         logs, motions = simulate_clean(stage, seed)
         measurements, starts = prepare_logs(space, logs, stage.machine.filter)
         true = [_true_trajectory(space, motion, start) for motion, start in zip(motions, starts, strict=True)]
-        fit = fit_logs(
-            space,
-            measurements,
-            true,
-            X,
-            starts,
-            0.0,
-            stage.data.held,
-            RESUMED_DAMPING,
-            sufficient_step=ACCEPTABLE_STEP,  # such a step changes the cost by about one
-            patient=False,
-        )
-    except (SimulationError, NotConvergedError):
+    except SimulationError:
         return None
-    return _sum_squares(fit)
+    # Such a step changes the cost by about one.
+    settings = Settings(RESUMED_PASSES, RESUMED_DAMPING, tolerance=ACCEPTABLE_STEP)
+    fit = fit_logs(space, measurements, true, X, starts, stage.data.held, settings=settings)
+    return _sum_squares(fit) if fit.step <= ACCEPTABLE_STEP else None
 
 
 def _true_trajectory(space: StateSpace, motion: Motion, start: Trajectory) -> Trajectory:

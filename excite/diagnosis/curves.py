@@ -123,9 +123,9 @@ def _signals(fit: TorqueFit, torques: Sequence[np.ndarray]) -> list[Signal]:
     model, found = fit.model, list[Signal]()
     for body in (b for b in model.machine.body if b.coordinates):
         unit = "rad" if body.joint == "revolute" else "m"
-        at = partial(model.machine.joint_values, body)
-        found.append(Signal("angle", body, unit, [at(r.q[r.at].T) for r in fit.rows]))
-        found.append(Signal("speed", body, f"{unit}/s", [at(r.nu[r.at].T) for r in fit.rows]))
+        angle, speed = partial(model.machine.joint_positions, body), partial(model.machine.joint_values, body)
+        found.append(Signal("angle", body, unit, [angle(r.q[r.at].T) for r in fit.rows]))
+        found.append(Signal("speed", body, f"{unit}/s", [speed(r.nu[r.at].T) for r in fit.rows]))
     for k, (body, (_, unit)) in enumerate(zip(model.machine.actuated, torque_names(model.machine), strict=True)):
         found.append(Signal("torque", body, unit, [u[r.at, k] for u, r in zip(torques, fit.rows, strict=True)]))
     return found

@@ -24,6 +24,7 @@ from excite.model import Model, build, required_signs
 from excite.model.effects import PlacedEffect
 from excite.model.machine import Filter, Machine
 from excite.smoothing import (
+    PROCESS_NOISE_LEVELS,
     Fit,
     Measurements,
     NotConvergedError,
@@ -40,20 +41,23 @@ from excite.smoothing import (
 from excite.text import format_number
 
 # Cost: sum of squared innovations over their variances. A right model's cost is about the number of readings.
-MIN_COST_GAIN_OF_CLOSE_FIT = 100.0  # cost by which an unconverged fit must beat a close one to be continued; chosen
 TRACKING_COST_RATIO = 2.5  # cost over its expected value up to which exact dynamics track the logs; chosen
 LOST_COST_RATIO = 10.0  # cost over the number of readings from which a fit is given up after a few passes; chosen
 FRICTION_ERROR = 0.1  # share of friction near rest by which an effect's formula may err there; chosen
 COST_TOLERANCE = 0.02  # share of its expected value by which a right model's cost may be larger; chosen
 IMPOSSIBLE_SIGN_STDS = 3.0  # standard deviations beyond zero from which a parameter's sign is impossible; chosen
 IMPOSSIBLE_SIGN_SHARE = 0.5  # share of the parameter's scale beyond zero, likewise; chosen
-RESUMED_PASSES = 14  # largest number of passes of a fit that continues another; chosen
+MAX_PASSES, RESUMED_PASSES = 20, 14  # of a fit from the start, and of one that continues another; chosen
 SENSOR_NOISE_INFLATIONS = 10.0, 30.0  # factors on the sensors' standard deviations, tried in turn; chosen
 PROCESS_NOISE_REDUCTIONS = 0.1, 0.3  # shares of a fit's process noise that are tried next, in turn; chosen
 PROCESS_NOISE_LADDER = (  # all levels that are tried
-    *(share * identification.PROCESS_NOISE_LEVELS[0] for share in PROCESS_NOISE_REDUCTIONS),
-    *identification.PROCESS_NOISE_LEVELS,
+    *(share * PROCESS_NOISE_LEVELS[0] for share in PROCESS_NOISE_REDUCTIONS),
+    *PROCESS_NOISE_LEVELS,
 )
+CLOSE_FIT_COST_RATIO = 1.3  # cost over its expectation from noise; above it first-order gains are rough; chosen
+FIRST_DAMPING, RESUMED_DAMPING = 25.0, 0.25  # see `smoothing.Settings`: of a fit from the start, and of one continued
+SUFFICIENT_STEP = 0.5  # [standard deviations] that ends a fit whose intervals are not reported; chosen
+FULL_STEP = 0.02  # [standard deviations] that ends a fit to full convergence
 MIN_PROCESS_NOISE = PROCESS_NOISE_LADDER[0]
 
 
@@ -142,7 +146,7 @@ class ExtendedFit:
     @property
     def is_close(self) -> bool:
         """Tell if the cost is near its expected value."""
-        return self.fit.cost <= smoothing.CLOSE_FIT_COST_RATIO * self.expected_cost
+        return self.fit.cost <= CLOSE_FIT_COST_RATIO * self.expected_cost
 
     @cached_property
     def fitted_logs(self) -> tuple[score_test.FittedLog, ...]:
@@ -262,9 +266,9 @@ def fit_machine(
     data = prepare_data(machine, logs, filter, friction_near_rest)
     calls: list[Callable[[], Any]] = [
         partial(_fit_exact_from_start, data),
-        partial(_fit_reducing_process_noise, machine, data, identification.PROCESS_NOISE_LEVELS[0]),
+        partial(_fit_reducing_process_noise, machine, data, PROCESS_NOISE_LEVELS[0]),
         *(
-            partial(fit_from_start, inflate_sensor_noise(data, times), identification.PROCESS_NOISE_LEVELS[0])
+            partial(fit_from_start, inflate_sensor_noise(data, times), PROCESS_NOISE_LEVELS[0])
             for times in SENSOR_NOISE_INFLATIONS
         ),
     ]
@@ -282,7 +286,7 @@ def fit_machine(
     if stage is not None and stage.is_close:
         return exact_if_close(stage)
     return (
-        _fit_by_noise_levels(machine, data, identification.PROCESS_NOISE_LEVELS[1:], runner)
+        _fit_by_noise_levels(machine, data, PROCESS_NOISE_LEVELS[1:], runner)
         if stage is None
         else _resume_with_least_noise(stage, runner)
     )
@@ -296,9 +300,7 @@ def fit_with_process_noise(stage: ExtendedFit, runner: CallRunner) -> ExtendedFi
     """
     if stage.process_noise_fit is not None:
         return _resume_with_least_noise(stage.process_noise_fit, runner)
-    return _fit_by_noise_levels(
-        stage.machine, inflate_sensor_noise(stage.data, 1.0), identification.PROCESS_NOISE_LEVELS[1:], runner
-    )
+    return _fit_by_noise_levels(stage.machine, inflate_sensor_noise(stage.data, 1.0), PROCESS_NOISE_LEVELS[1:], runner)
 
 
 def _fit_by_noise_levels(
@@ -324,12 +326,9 @@ def _fit_by_noise_levels(
 def _fit_with_file_parameters(data: FitData) -> Fit:
     """Fit the trajectories alone, with the machine file's parameters and small process noise."""
     all_held = replace(data, held=np.ones_like(data.held))
-    try:
-        fit = iterate(all_held, data.starts, data.space.model.nominal, identification.PROCESS_NOISE_LEVELS[0])
-    except NotConvergedError as failed:
-        if failed.fit is None:
-            raise
-        fit = failed.fit
+    fit = iterate(all_held, data.starts, data.space.model.nominal, PROCESS_NOISE_LEVELS[0])
+    if not fit.linear:
+        fit.required()
     unknown = np.full_like(fit.covariance, np.nan)
     known = smoothing.prior_information(data.space.model, data.held, fit.X)
     return without_smoother_levels(replace(fit, unidentifiable=data.held, prior=known, covariance=unknown))
@@ -371,27 +370,15 @@ def resume_with_true_sensor_noise(
 
 
 def fit_from_start(
-    data: FitData, process_noise: float, cost_limit: float = np.inf, max_cost: float = np.inf, patient: bool = False
+    data: FitData, process_noise: float, cost_limit: float = np.inf, patient: bool = False
 ) -> Fit | None:
     """Fit from initial trajectories; None if no fit is found.
 
-    cost_limit: cost above which the fit is given up. max_cost: cost above which it is given up once costs stagnate.
-    patient: iterate to the end; nearly converged fits count as none.
+    cost_limit: cost above which the fit is given up. patient: iterate to the end; nearly converged fits count as none.
     """
-    try:
-        return without_smoother_levels(
-            iterate(
-                data,
-                data.starts,
-                data.space.model.nominal,
-                process_noise,
-                cost_limit=cost_limit,
-                patient=patient,
-                max_cost=max_cost,
-            )
-        )
-    except NotConvergedError as failed:
-        return None if failed.acceptable_fit is None or patient else without_smoother_levels(failed.acceptable_fit)
+    fit = iterate(data, data.starts, data.space.model.nominal, process_noise, cost_limit=cost_limit, patient=patient)
+    usable = fit.status == "converged" or (not patient and fit.step <= smoothing.ACCEPTABLE_STEP)
+    return without_smoother_levels(fit) if usable else None
 
 
 def _fit_exact_from_start(data: FitData) -> FitPair | None:
@@ -411,7 +398,7 @@ def _fit_reducing_process_noise(machine: Machine, data: FitData, process_noise: 
 
 def _fit_below_cost(data: FitData, process_noise: float, max_cost: float) -> Fit | None:
     """Fit from initial trajectories with process noise; None if it costs more than max_cost."""
-    fit = fit_from_start(data, process_noise, max_cost=max_cost)
+    fit = fit_from_start(data, process_noise, max_cost)
     return None if fit is None or fit.cost > max_cost else fit
 
 
@@ -522,11 +509,11 @@ def _resume_or_none(
 
 
 def resume_fit(data: FitData, previous: ExtendedFit, process_noise: float, cost_limit: float = np.inf) -> Fit:
-    """Fit data of another model, starting from a previous fit. Raises NotConvergedError.
+    """Fit data of another model, starting from a previous fit.
 
-    If the first attempt fails, it is accepted as it is, or continued once, if its cost shows that it is on the way.
+    A fit that ran out of passes is accepted if its cost is close to what noise makes. Raises NotConvergedError.
     """
-    space, initially_held = data.space, _initially_held(data, previous, process_noise)
+    space = data.space
     old = dict(zip(previous.model.base.names, previous.fit.X, strict=True))
     X = np.array([old.get(n, x) for n, x in zip(space.model.base.names, space.model.nominal, strict=True)])
     X = np.where(data.held, space.model.nominal, X)
@@ -534,35 +521,11 @@ def resume_fit(data: FitData, previous: ExtendedFit, process_noise: float, cost_
         transfer_trajectory(space, r, p, previous.data.space, X)
         for r, p in zip(data.measurements, previous.fit.trajectories, strict=True)
     ]
-    try:
-        fit = _iterate_resumed(data, trajectories, X, process_noise, cost_limit, initially_held)
-    except NotConvergedError as failed:
-        found = failed.fit
-        if found is None:
-            raise
-        if process_noise > 0:
-            # Accept a fit that came close where the previous one with such noise did not: an effect that begins or
-            # ends at an instant may keep it from converging, and exact dynamics judge it later.
-            comparable = (
-                previous.fit.process_noise >= process_noise and previous.data.noise_inflation == data.noise_inflation
-            )
-            if (
-                comparable
-                and not previous.is_close
-                and found.cost <= min(smoothing.CLOSE_FIT_COST_RATIO * data.expected_cost, cost_limit)
-            ):
-                return without_smoother_levels(found)
-            raise
-        # Continue an exact fit that came close where the previous one did not, or that is much better than it.
-        was_close = previous.is_close and previous.data.noise_inflation == data.noise_inflation and not data.sticks
-        acceptable = (
-            previous.fit.cost - MIN_COST_GAIN_OF_CLOSE_FIT
-            if was_close
-            else smoothing.CLOSE_FIT_COST_RATIO * data.expected_cost
-        )
-        if found.cost > min(acceptable, cost_limit):
-            raise
-        fit = _iterate_resumed(data, found.trajectories, found.X, process_noise, cost_limit, initially_held)
+    X = np.where(_initially_held(data, previous, process_noise), space.model.nominal, X)
+    fit = iterate(data, trajectories, X, process_noise, RESUMED_DAMPING, RESUMED_PASSES, cost_limit)
+    near = fit.status != "stopped" and fit.cost <= min(CLOSE_FIT_COST_RATIO * data.expected_cost, cost_limit)
+    if fit.step > smoothing.ACCEPTABLE_STEP and not near:
+        fit.required()
     return without_smoother_levels(fit)
 
 
@@ -582,69 +545,27 @@ def _initially_held(data: FitData, previous: ExtendedFit, process_noise: float) 
     return np.array([n in unseen for n in names])
 
 
-def _iterate_resumed(
-    data: FitData,
-    trajectories: Sequence[Trajectory],
-    X: np.ndarray,
-    process_noise: float,
-    cost_limit: float,
-    initially_held: np.ndarray,
-) -> Fit:
-    """Iterate from another fit; accept one that nearly converged. Raises NotConvergedError."""
-    try:
-        return iterate(
-            data,
-            trajectories,
-            X,
-            process_noise,
-            smoothing.RESUMED_DAMPING,
-            RESUMED_PASSES,
-            cost_limit,
-            initially_held=initially_held,
-        )
-    except NotConvergedError as failed:
-        found = failed.acceptable_fit or failed.oscillating_fit
-        if found is None:
-            raise
-        return found
-
-
 def iterate(
     data: FitData,
     trajectories: Sequence[Trajectory],
     X: np.ndarray,
     process_noise: float,
-    damping: float = smoothing.INITIAL_DAMPING,
-    passes: int = smoothing.MAX_PASSES,
+    damping: float = FIRST_DAMPING,
+    passes: int = MAX_PASSES,
     cost_limit: float = np.inf,
     patient: bool = False,
-    max_cost: float = np.inf,
-    initially_held: np.ndarray | None = None,
 ) -> Fit:
-    """Fit from given trajectories and parameters X (n_base,).
+    """Fit from given trajectories and parameters X (n_base,); the fit has a status.
 
     With process noise above its minimum an acceptable step ends the fit: likelihood ratios are much larger than what a
-    further pass changes. Otherwise a sufficient step ends it; a patient fit goes to full convergence. Raises
-    NotConvergedError.
+    further pass changes. Otherwise a sufficient step ends it; a patient fit goes to full convergence.
     """
-    sufficient_step = 0.0 if patient else smoothing.SUFFICIENT_STEP
+    tolerance = FULL_STEP if patient else SUFFICIENT_STEP
     if process_noise > MIN_PROCESS_NOISE:
-        sufficient_step = smoothing.ACCEPTABLE_STEP
+        tolerance = smoothing.ACCEPTABLE_STEP
+    settings = smoothing.Settings(passes, damping, tolerance=tolerance, cost_limit=cost_limit)
     return smoothing.fit_logs(
-        data.space,
-        data.measurements,
-        trajectories,
-        X,
-        data.starts,
-        process_noise,
-        data.held,
-        damping,
-        passes,
-        sufficient_step,
-        cost_limit,
-        patient,
-        max_cost,
-        initially_held,
+        data.space, data.measurements, trajectories, X, data.starts, data.held, process_noise, settings
     )
 
 

@@ -16,11 +16,18 @@ import scipy.stats
 
 from excite import identification, smoothing
 from excite.diagnosis import selection
-from excite.diagnosis.fits import MIN_PROCESS_NOISE, PROCESS_NOISE_LADDER, ExtendedFit
+from excite.diagnosis.fits import (
+    MIN_PROCESS_NOISE,
+    PROCESS_NOISE_LADDER,
+    RESUMED_DAMPING,
+    RESUMED_PASSES,
+    SUFFICIENT_STEP,
+    ExtendedFit,
+)
 from excite.logs import filtered_regression
 from excite.model import build
 from excite.model.machine import Machine
-from excite.smoothing import Fit, NotConvergedError, predict_readings
+from excite.smoothing import PROCESS_NOISE_LEVELS, Fit, predict_readings
 
 STRETCH_S = 2.0  # length of a withheld stretch [s]; chosen
 WANTED_STRETCHES = 20  # number of stretches; chosen
@@ -190,27 +197,15 @@ def _errors_of_turn(
             used[a:b] = 0.0
         masked.append(replace(r, used=used))
     rest: Fit | None = None
-    levels = MIN_PROCESS_NOISE, *identification.PROCESS_NOISE_LEVELS[:-1]  # for a wrong model without a fit to the rest
+    levels = MIN_PROCESS_NOISE, *PROCESS_NOISE_LEVELS[:-1]  # for a wrong model without a fit to the rest
     for process_noise in (fit.process_noise, *(x for x in levels if x > fit.process_noise)):
-        try:
-            rest = smoothing.fit_logs(
-                space,
-                masked,
-                fit.trajectories,
-                fit.X,
-                data.starts,
-                process_noise,
-                held,
-                smoothing.RESUMED_DAMPING,
-                # A prediction needs no accurate covariance.
-                sufficient_step=smoothing.ACCEPTABLE_STEP if process_noise > 0 else smoothing.SUFFICIENT_STEP,
-                patient=False,
-            )
-        except NotConvergedError as failed:
-            rest = failed.acceptable_fit
-        if rest is not None:
+        # A prediction needs no accurate covariance.
+        tolerance = smoothing.ACCEPTABLE_STEP if process_noise > 0 else SUFFICIENT_STEP
+        settings = smoothing.Settings(RESUMED_PASSES, RESUMED_DAMPING, tolerance=tolerance)
+        rest = smoothing.fit_logs(space, masked, fit.trajectories, fit.X, data.starts, held, process_noise, settings)
+        if rest.step <= smoothing.ACCEPTABLE_STEP:
             break
-    if rest is None:
+    if rest is None or rest.step > smoothing.ACCEPTABLE_STEP:
         return None
     squares, counts, motion, noise = [], [], [], []
     for r, p, own in zip(data.measurements, rest.trajectories, stretches, strict=True):

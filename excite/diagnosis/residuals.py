@@ -13,12 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from excite import identification
 from excite.diagnosis.fits import ExtendedFit, refit_all, with_true_sensor_noise
 from excite.diagnosis.parallel import run_in_turn
 from excite.diagnosis.residual_tests import MIN_SYSTEMATIC_MEAN_SQUARE, TONE_MARGIN
 from excite.diagnosis.spectrum import strongest_line
-from excite.smoothing import LinearisedLog, advance, differentiate, state_scale
+from excite.smoothing import PROCESS_NOISE_LEVELS, LinearisedLog, differentiate, integrate, state_scale
 from excite.text import format_number
 
 BLOCK_S = 0.25  # length of a block [s] whose mean is the slow error; chosen
@@ -85,7 +84,7 @@ class InnovationLevel:
 
 def refit_with_process_noise(stage: ExtendedFit) -> ExtendedFit:
     """Refit the same model with process noise of at least the first level, if there is such a fit."""
-    least, known = identification.PROCESS_NOISE_LEVELS[0], stage
+    least, known = PROCESS_NOISE_LEVELS[0], stage
     while known.fit.process_noise < least or known.data.noise_inflation > 1:
         if known.process_noise_fit is None:
             (found,) = refit_all([(stage.machine, stage, least)], run_in_turn)
@@ -137,8 +136,9 @@ def _process_forces(stage: ExtendedFit, s: np.ndarray, u: np.ndarray) -> list[tu
     Each comes as label, values (N,), unit, and driven body or None.
     """
     space, X, model = stage.data.space, stage.fit.X, stage.model
-    defect = (s[1:] - advance(space, s[:-1], u[:-1], u[1:], X)) / state_scale(space)
-    F = differentiate(space, s, u[:-1], u[1:], X, force=True).F / state_scale(space)[:, None]
+    steps = integrate(space, s, u[:-1], u[1:], X)
+    defect = (s[1:] - steps.end) / state_scale(space)
+    F = differentiate(space, steps, X, force=True).F / state_scale(space)[:, None]
     square = F.transpose(0, 2, 1) @ F
     square += 1e-12 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(F.shape[2])
     force = np.linalg.solve(square, F.transpose(0, 2, 1) @ np.nan_to_num(defect)[:, :, None])[:, :, 0]

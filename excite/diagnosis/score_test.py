@@ -32,6 +32,7 @@ from excite.smoothing import (
     Trajectory,
     WhitenedInnovations,
     differentiate,
+    integrate,
     smoothed_motion,
     whiten,
     whiten_signatures,
@@ -242,7 +243,7 @@ def _fitted_log(space: StateSpace, r: Measurements, p: Trajectory, linear: Linea
         if 2 * n_q <= at < 2 * n_q + wheels.shape[1]:
             wheels[:, at - 2 * n_q] = p.state[:, k]
     exact = model.read(q.T, nu.T, wheels.T, u.T, z.T, X).full().T
-    slopes, white = _input_sensitivities(space, p, u, X), whiten(linear, space.reading_parameters)
+    slopes, white = _input_sensitivities(space, p, u, X), whiten(linear)
     at = model.true_coordinates(q, X)
     over = p.ground_inputs if model.map_inputs else passes(model, at, nu, 1 / float(model.machine.sampling_hz))
     return FittedLog(space, linear, len(r.offset_sensors), q, nu, a, u, t, exact, model.expand @ X, slopes, white, over)
@@ -336,7 +337,8 @@ def _input_sensitivities(space: StateSpace, p: Trajectory, u: np.ndarray, X: np.
     found = np.empty((N - 1, space.n, u.shape[1] + len(free)), np.float32)
     for at in range(0, N - 1, BATCH_SIZE):
         until = min(at + BATCH_SIZE, N - 1)
-        by = differentiate(space, p.state[at : until + 1], inputs[at:until], inputs[at + 1 : until + 1], X, force=True)
+        steps = integrate(space, p.state[at : until + 1], inputs[at:until], inputs[at + 1 : until + 1], X)
+        by = differentiate(space, steps, X, force=True)
         found[at:until] = np.concatenate([by.B, by.F[:, :, free]], axis=2) / (2 * scale[:, None])
     return found
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
-from excite import identification
 from excite.diagnosis import score_test
 from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.fits import (
@@ -38,7 +37,7 @@ from excite.logs import Log
 from excite.model import effects
 from excite.model.effects import Effect, PlacedEffect
 from excite.model.machine import EffectEntry, Machine, Quantity
-from excite.smoothing import NotConvergedError
+from excite.smoothing import PROCESS_NOISE_LEVELS, NotConvergedError
 
 # Significance. Logs without any effect stay below a likelihood ratio of 16. By chi-squared and Bonferroni, at most
 # 2.1 % of logs of a minute exceed the required ratio (371 candidates of va12 with all shapes), 2.7 % of longer (441).
@@ -434,7 +433,7 @@ def choose_with_inflated_noise(stage: ExtendedFit, runner: CallRunner) -> tuple[
     is_comparable = [x for x in trials if stage.deviance - x[1].deviance >= VARIANT_SCORE_SHARE * gain]
     tracking: list[_Trial] = []
     explains_most = gain >= MIN_EXPLAINED_SHARE * (gain + best.excess_cost)
-    for process_noise in (0.0, identification.PROCESS_NOISE_LEVELS[0])[: 1 + explains_most]:
+    for process_noise in (0.0, PROCESS_NOISE_LEVELS[0])[: 1 + explains_most]:
         sharp = zip(
             is_comparable,
             resume_with_true_sensor_noise([x for _, x in is_comparable], process_noise, runner),
@@ -553,7 +552,7 @@ def _required_gain(
 
 def _noise_hides_misfit(stage: ExtendedFit) -> bool:
     """Tell if large process noise leaves a misfit: with it many wrong models come far."""
-    return stage.fit.process_noise >= identification.PROCESS_NOISE_LEVELS[0] and not stage.is_close
+    return stage.fit.process_noise >= PROCESS_NOISE_LEVELS[0] and not stage.is_close
 
 
 def _explains_rest(found: ExtendedFit, before: ExtendedFit) -> bool:

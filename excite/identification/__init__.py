@@ -1,9 +1,9 @@
 """Parameters of a machine from its logs, with their uncertainty.
 
-- `identify` estimates the base parameters from logs by one of `METHODS` and returns an `Estimate`: least squares (ols,
-  the paper's method, and wls, tls), instrumental variables (iv), output error (oe) or joint smoothing (joint), and the
-  linear ones restricted to physically possible machines (`ols+consistent`). `recommend_method` names the method for a
-  machine, `needed_sensors` what it must have measured.
+- `identify` estimates the base parameters from logs by one of `METHODS` and returns an `Estimate`: maximum likelihood
+  (inverse for fully driven machines, joint for others), least squares (ols, the paper's method), and inverse or ols
+  restricted to physically possible machines (`inverse+consistent`, `ols+consistent`). `recommend_method` names the
+  method for a machine, `needed_sensors` what it must have measured.
 - `verify` simulates a motion with sensor noise many times and identifies from each log (`Verification`), which shows
   bias, dispersion and coverage of the intervals.
 - `add_bias` estimates the bias of a method on given logs from simulated ones.

@@ -13,11 +13,11 @@ from .bias import (
 )
 from .consistency import possible_standard as possible_standard
 from .delays import describe_late_channels as describe_late_channels
-from .estimate import Estimate as Estimate
+from .estimate import Discrepancy as Discrepancy, Estimate as Estimate, FitTest as FitTest, widen as widen
 from .filter_choice import FILTERS as FILTERS
 from .identifiability import parameters_at_rest as parameters_at_rest
+from .inverse_estimate import recommend_method as recommend_method
 from .joint import (
-    PROCESS_NOISE_LEVELS as PROCESS_NOISE_LEVELS,
     find_suspect_sensors as find_suspect_sensors,
     shows_sticking as shows_sticking,
 )
@@ -34,7 +34,6 @@ from .methods import (
     corrected_logs as corrected_logs,
     identify as identify,
     needed_sensors as needed_sensors,
-    recommend_method as recommend_method,
     require_sensors as require_sensors,
     unused_sensors as unused_sensors,
 )
@@ -57,6 +56,7 @@ from .saved_estimate import (
 )
 from .slip_laws import SlipFit as SlipFit, SlipLaw as SlipLaw, fit_slip_laws as fit_slip_laws, soil_law as soil_law
 from .status import add_consistent as add_consistent
+from .torque_constant import TorqueConstant as TorqueConstant, torque_constant as torque_constant
 from .validation import (
     SignalComparison as SignalComparison,
     compare_motions as compare_motions,

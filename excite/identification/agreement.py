@@ -22,6 +22,7 @@ from excite.model.machine import Filter
 from excite.text import format_number, format_p_value, format_uncertain
 
 SIGNIFICANCE = 1e-3  # p-value below which logs disagree; chosen
+NOTABLE = 0.05  # p-value below which the differences between logs widen the intervals; chosen
 MAX_CHANGED = 4  # parameters that are named; more have no single cause; chosen
 
 
@@ -39,13 +40,15 @@ class ChangedParameter:
 class Agreement:
     """Comparison of logs. p_value: of a difference like theirs if nothing changed. changed: what differs.
 
-    explained: the logs agree apart from what changed.
+    explained: the logs agree apart from what changed. ratio: of the differences to what the covariances say, at least 1
+        (R. T. Birge, Phys. Rev. 40, 1932): the intervals of logs that agree only roughly are so much wider.
     """
 
     logs: tuple[str, ...]
     p_value: float
     changed: tuple[ChangedParameter, ...]
     explained: bool
+    ratio: float = 1.0
 
     @property
     def agree(self) -> bool:
@@ -103,7 +106,9 @@ def compare_logs(names: Sequence[str], estimates: Sequence[Estimate]) -> Agreeme
             columns = [k if log == 0 else n + (log - 1) * len(changed) + place for log in range(len(estimates))]
             name, unit = estimates[0].names[at[k]], estimates[0].units[at[k]]
             found.append(ChangedParameter(name, unit, x[columns] * scale[k], std[columns] * scale[k]))
-    return Agreement(tuple(names), first, tuple(found), p >= SIGNIFICANCE)
+    freedom = (len(estimates) - 1) * len(at)
+    ratio = float(np.sqrt(max(1.0, _misfit(values, information, [])[0] / freedom))) if first < NOTABLE else 1.0
+    return Agreement(tuple(names), first, tuple(found), p >= SIGNIFICANCE, ratio)
 
 
 def _inverse(covariance: np.ndarray) -> np.ndarray:
@@ -146,6 +151,11 @@ def _misfit(
 
 def describe_agreement(agreement: Agreement) -> str:
     """Say whether logs agree on the parameters, and what changed."""
+    if agreement.agree and agreement.ratio > 1:
+        return (
+            f"the {len(agreement.logs)} logs differ by {format_number(agreement.ratio, 2)} times what their intervals"
+            f" say (p = {format_number(agreement.p_value, 2)}): the intervals of all together are so much wider"
+        )
     if agreement.agree:
         return (
             f"one set of parameters explains the {len(agreement.logs)} logs (p = {format_number(agreement.p_value, 2)})"
@@ -175,6 +185,7 @@ def summarise_agreement(agreement: Agreement) -> dict[str, Any]:
         "agree": agreement.agree,
         "p_value": agreement.p_value,
         "explained": agreement.explained,
+        "ratio": agreement.ratio,
         "changed": {
             c.name: {"unit": c.unit, "value": c.value.tolist(), "std": c.std.tolist()} for c in agreement.changed
         },

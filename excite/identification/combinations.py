@@ -45,7 +45,8 @@ def describe_combinations(
         j = kept[i]
         factor = float(share[i] * size[k] / size[j] * scale[j] / scale[k])
         sign = "+" if factor > 0 else "-"
-        times = "" if abs(abs(factor) - 1) < 1e-3 else f"{format_number(abs(factor), 3)} "
+        size_text = format_number(abs(factor), 3)
+        times = "" if size_text == "1" else f"{size_text} "
         value = x[j] + factor * x[k]
         std = np.sqrt(max(known[j, j] + 2 * factor * known[j, k] + factor**2 * known[k, k], 0.0))
         parts.append(f"{names[j]} {sign} {times}{names[k]} = {format_uncertain(value, std, units[j])}")

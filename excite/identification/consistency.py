@@ -21,10 +21,12 @@ from excite.identification.estimate import Estimate, add_notes
 from excite.identification.linear_methods import Block, residual, rms_torque
 from excite.model import Model, required_signs, standard_parameters
 from excite.model.mechanics import INERTIAL
+from excite.text import format_number
 
 INTERIOR_MARGIN = 1e-6  # distance from the constraints, of a parameter's scale; keeps the mass matrix invertible
-PULL = 0.01  # of bodies to the machine file's: 100 % off there costs as much as 0.1 standard deviations; chosen
 NOTABLE_SHIFT = 1e-3  # smallest shift that is reported [standard deviations]; chosen
+SAME_TORQUES = 1e-3  # of their size (rms), by which two machines may differ and count as the same
+RANDOM_MOTIONS = 300  # over which torques are compared
 
 
 def nearest_possible(model: Model, estimate: Estimate) -> Estimate:
@@ -35,7 +37,7 @@ def nearest_possible(model: Model, estimate: Estimate) -> Estimate:
     bound at an active constraint. The residual is not recomputed (see `constrained_estimate`). Raises
     NotConsistentError.
     """
-    kept, distance, _, X = _nearest(model, estimate, 0.0)
+    kept, distance, X = _nearest(model, estimate)
     value = np.full(len(estimate.value), np.nan)
     value[kept] = X[kept]
     shift_in_stds = (value[kept] - estimate.value[kept]) / estimate.std[kept]
@@ -57,40 +59,70 @@ def constrained_estimate(model: Model, estimate: Estimate, blocks: Sequence[Bloc
     return replace(found, residual=e, relative_error_percent=100 * float(np.sqrt(np.mean(e**2))) / rms_torque(blocks))
 
 
-def possible_standard(model: Model, estimate: Estimate) -> dict[str, float]:
-    """Return the standard parameters [SI] of a possible machine near the estimate and near the machine file, by name.
+def possible_standard(model: Model, estimate: Estimate) -> tuple[dict[str, float], str | None]:
+    """Return the standard parameters [SI] by name of a possible machine with the estimated torques, and a note.
 
-    What the logs do not show is that of the machine file, if possible. What they show is the estimate, to a small share
-    of its standard deviations if that is possible: the pull to the machine file keeps bodies of a usual size where only
-    extreme ones have the estimated values. Raises NotConsistentError.
+    Of all such machines it is the nearest to the machine file, relative to the size of each parameter. If no possible
+    machine has the estimated values, it is one with those of the nearest possible estimate, and the note says how far
+    that is; otherwise the note is None. Raises NotConsistentError.
     """
-    return _nearest(model, estimate, PULL)[2]
+    kept, distance, X = _nearest(model, estimate)
+    scaled, by_name, base = _variables(model)
+    nominal = np.array([v for v, _ in standard_parameters(model.machine).values()]) / _scales(model)
+    for target in (estimate.value, X):
+        equal = (base[kept] - target[kept]) / model.scale[kept] == 0
+        # half the margin, as X lies on the whole one
+        possible = _possibility_constraints(model, by_name, INTERIOR_MARGIN / 2)
+        problem = cp.Problem(cp.Minimize(cp.sum_squares(scaled - nominal)), [equal, *possible])
+        if _solved(problem):
+            break
+    else:
+        raise NotConsistentError("no possible machine found near the estimate")
+    standard = {name: float(x.value) for name, x in by_name.items()}
+    wanted = np.where(np.isfinite(estimate.value), estimate.value, np.asarray(base.value))
+    gap = _torque_gap(model, np.asarray(base.value), wanted)
+    if gap < SAME_TORQUES:
+        return standard, None
+    return standard, (
+        f"no real machine has the identified values: the nearest possible one is written, {distance:.1f} standard"
+        f" deviations away; its torques differ by {format_number(100 * gap, 2)} % (rms over random motions)"
+    )
 
 
-def _nearest(model: Model, estimate: Estimate, pull: float) -> tuple[np.ndarray, float, dict[str, float], np.ndarray]:
+def _torque_gap(model: Model, X: np.ndarray, wanted: np.ndarray) -> float:
+    """Return by how much torques of base parameters X (n_base,) differ from those wanted, of their rms."""
+    rng = np.random.default_rng(0)
+    n = len(model.coordinates)
+    beside = [np.zeros((x.numel(), RANDOM_MOTIONS)) for x in model.effect_symbols()]
+    W = model.stacked_regressor(*rng.uniform(-1, 1, (3, n, RANDOM_MOTIONS)), *beside)
+    return float(np.linalg.norm(W @ (X - wanted)) / max(np.linalg.norm(W @ wanted), np.finfo(float).tiny))
+
+
+def _nearest(model: Model, estimate: Estimate) -> tuple[np.ndarray, float, np.ndarray]:
     """Find the nearest possible machine in the metric of the estimate's covariance.
 
-    pull: weight of the squared distance to the machine file, relative to the size of each standard parameter.
-    Returns identified parameters (indices), distance [standard deviations], standard parameters, base parameters.
+    Returns identified parameters (indices), distance [standard deviations], base parameters.
     """
     kept = np.flatnonzero(np.isfinite(estimate.value) & np.isfinite(estimate.std))
-    scaled, by_name, X = _variables(model)
-    nominal = np.array([v for v, _ in standard_parameters(model.machine).values()]) / _scales(model)
+    _, by_name, X = _variables(model)
     shift = (X[kept] - estimate.value[kept]) / model.scale[kept]
     covariance = estimate.covariance[np.ix_(kept, kept)] / np.outer(model.scale[kept], model.scale[kept])
     cost = cp.sum_squares(_inverse_root(covariance) @ shift)
-    far = pull * cp.sum_squares(scaled - nominal) if pull else 0.0
-    problem = cp.Problem(cp.Minimize(cost + far), _possibility_constraints(model, by_name, INTERIOR_MARGIN))
+    problem = cp.Problem(cp.Minimize(cost), _possibility_constraints(model, by_name, INTERIOR_MARGIN))
+    if not _solved(problem) or X.value is None:
+        raise NotConsistentError(f"no possible machine found near the estimate: the solver says {problem.status}")
+    return kept, float(np.sqrt(max(cost.value, 0.0))), np.asarray(X.value)
+
+
+def _solved(problem: cp.Problem) -> bool:
+    """Solve a convex program; return whether it has a solution."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of an inaccurate solution, which the status tells as well
             problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
-    except cp.error.SolverError as err:
-        raise NotConsistentError(f"no possible machine found near the estimate: {err}") from None
-    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or X.value is None:
-        raise NotConsistentError(f"no possible machine found near the estimate: the solver says {problem.status}")
-    standard = {name: float(x.value) for name, x in by_name.items()}
-    return kept, float(np.sqrt(max(cost.value, 0.0))), standard, np.asarray(X.value)
+    except cp.error.SolverError:
+        return False
+    return problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
 
 
 def is_possible(model: Model, X: np.ndarray) -> bool:
@@ -112,8 +144,8 @@ def _variables(model: Model) -> tuple[cp.Variable, dict[str, cp.Expression], cp.
 
 def _possibility_constraints(model: Model, p: dict[str, cp.Expression], margin: float) -> list[cp.Constraint]:
     """Constraints of a possible machine on its standard parameters, with a margin relative to their nominal size."""
-    nominal = {name: abs(value) for name, (value, _) in standard_parameters(model.machine).items()}
-    constraints = [sign * p[name] >= margin * nominal[name] for name, sign in required_signs(model.machine).items()]
+    size = dict(zip(p, _scales(model), strict=True))
+    constraints = [sign * p[name] >= margin * size[name] for name, sign in required_signs(model.machine).items()]
     for body in model.machine.body:
         k = body.index
         if body.inertia is not None:
@@ -122,10 +154,10 @@ def _possibility_constraints(model: Model, p: dict[str, cp.Expression], margin: 
                 parameters["YY"] = parameters["XX"]
             m, h, second = _pseudo_inertia(parameters)
             # A length scales the blocks (mass, moments, inertias) to one size.
-            inertia = nominal.get(f"ZZ{k}", 0.0)
-            length = float(np.sqrt(inertia / nominal[f"M{k}"])) if inertia > 0 else 1.0
+            mass = size[f"M{k}"]
+            length = float(np.sqrt(size[f"ZZ{k}"] / mass))
             S = cp.bmat([[second / length**2, h / length], [h.T / length, cp.reshape(m, (1, 1), order="C")]])
-            constraints.append(S / nominal[f"M{k}"] >> margin * np.eye(4))
+            constraints.append(S / mass >> margin * np.eye(4))
     return constraints
 
 
@@ -149,9 +181,26 @@ def _pseudo_inertia(parameters: dict[str, cp.Expression]) -> tuple[cp.Expression
 
 
 def _scales(model: Model) -> np.ndarray:
-    """Size of each standard parameter: its nominal value, or the base parameters' median scale if that is zero."""
-    values = np.array([abs(v) for v, _ in standard_parameters(model.machine).values()])
-    return np.where(values > 0, values, max(1.0, float(np.median(model.scale))))
+    """Return a size of each standard parameter, from what the machine file says of the whole body.
+
+    A first moment or product of inertia near zero has the size that a body of that mass and radius of gyration may
+    have; a body without mass has the sizes of the others.
+    """
+    table = {name: value for name, (value, _) in standard_parameters(model.machine).items()}
+    usual = max(1.0, float(np.median(model.scale)))
+    size = {name: abs(value) or usual for name, value in table.items()}
+    bodies = [b.index for b in model.machine.body if b.inertia is not None]
+    masses = {k: table[f"M{k}"] for k in bodies}
+    around = {k: sum(table.get(f"{n}{k}", 0.0) for n in ("XX", "YY", "ZZ")) for k in bodies}
+    lengths = {k: np.sqrt(around[k] / masses[k]) for k in bodies if masses[k] > 0 and around[k] > 0}
+    mass = float(np.median([m for m in masses.values() if m > 0] or [1.0]))
+    length = float(np.median(list(lengths.values()) or [1.0]))
+    for k in bodies:
+        m, reach = masses[k] or mass, float(lengths.get(k, length))
+        for name in INERTIAL:
+            if f"{name}{k}" in size:
+                size[f"{name}{k}"] = m * reach ** {"M": 0, "MX": 1, "MY": 1, "MZ": 1}.get(name, 2)
+    return np.array(list(size.values()))
 
 
 def _inverse_root(covariance: np.ndarray) -> np.ndarray:

@@ -58,9 +58,7 @@ def parameters_at_rest(model: Model, logs: Sequence[Log], filter: Filter, slow: 
     return (np.diag(rest_projection(model, logs, filter, slow)) == 0) & np.isnan(model.known.std)
 
 
-def rest_projection(
-    model: Model, logs: Sequence[Log], filter: Filter, slow: bool = False, motions: Sequence[Samples] | None = None
-) -> np.ndarray:
+def rest_projection(model: Model, logs: Sequence[Log], filter: Filter, slow: bool = False) -> np.ndarray:
     """Build the matrix (n_base, n_base) that maps a regressor to that of a machine with parts exactly at rest.
 
     With the measured motion, the noise of a joint at rest would count as motion. A column without effect becomes zero,
@@ -69,7 +67,6 @@ def rest_projection(
     A joint is at rest if its encoder moves within STILL_COUNTS. If one is, the root is at rest below STILL_SPEED on
     average over a second.
     slow: every coordinate below STILL_SPEED is at rest.
-    motions: of the logs, if they are known better than by filtering.
 
     Returns the identity for a machine with effects, and if nothing is at rest.
     """
@@ -86,7 +83,7 @@ def rest_projection(
     ]
     if not joints and not slow:
         return identity
-    samples_of_logs = motions or [_with_unmeasured(model, log, samples(model, log, filter)) for log in logs]
+    samples_of_logs = [_with_unmeasured(model, log, samples(model, log, filter)) for log in logs]
     root = (
         [coordinate_index(c) for c in machine.body[0].coordinates if c in model.coordinates] if machine.planar else []
     )

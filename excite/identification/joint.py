@@ -8,7 +8,7 @@ boundary value problem).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,117 +16,126 @@ import numpy as np
 from excite.errors import NotIdentifiableError
 from excite.identification import identifiability
 from excite.identification.combinations import describe_combinations
-from excite.identification.estimate import NOTHING_MOVES_MESSAGE, Estimate, held_note
+from excite.identification.estimate import NOTHING_MOVES_MESSAGE, Discrepancy, Estimate, held_note
 from excite.identification.near_rest import friction_near_rest, sticking
 from excite.logs import Log, decimate, derivative
 from excite.model import Model
 from excite.model.machine import Filter
 from excite.simulation import outside_law
 from excite.smoothing import (
+    ACCEPTABLE_STEP,
     MAX_IDENTIFIABLE_STD,
+    PROCESS_NOISE_LEVELS,
     Fit,
     Measurements,
+    Missing,
     NotConvergedError,
+    Settings,
     StateSpace,
     Trajectory,
     build_state_space,
     common_sensors,
+    describe_missing,
     describe_noise,
     fit_logs,
+    fit_unknown_forces,
     innovation_statistics,
+    lacks_forces,
     prepare_logs,
     quantify_uncertainty,
     smoothed_motion,
 )
 from excite.text import format_number
 
-# Largest step of an estimate whose iteration ran out of passes [standard deviations]; chosen.
-ACCEPTED_STEP = 0.1
-# Levels of process noise, tried in turn until the innovations are as expected; chosen.
-PROCESS_NOISE_LEVELS = (1.0, 4.0, 16.0)
+LOST_COST_RATIO = 3.0  # cost over the number of readings above which exact dynamics are not followed any further
 # Mean square of a sensor's normalised innovations that the model does not explain. Logs without a cause stay below 1.6.
 SUSPECT_MEAN_SQUARE = 2.5
 UNEXPLAINED_DOUBT = (
-    "the model does not explain this log: the values allow for process noise, and may be off by much more than their"
+    "the model does not explain this log: the values allow for forces that it lacks, and may be off by more than their"
     " intervals if the cause is a sensor or a torque channel; run `excite diagnose`"
 )
+CLOSE_STEP = 0.5  # [standard deviations] next step of a fit that is close enough to the most likely values; chosen
 STICKING_RATIO = 2.0  # mean square of torque errors near rest over that in motion, above which friction sticks; chosen
 MIN_STICKING_SAMPLES = 30  # near rest, to tell whether friction sticks; chosen
-BIASED_NOTE = (
-    "parameters that this log excites poorly may be off by one standard deviation more than their interval says, as"
-    " only a biased estimate was found: record a drive with more motion"
-)
+
+
+class UnexplainedError(NotConvergedError):
+    """The model alone does not explain the logs."""
 
 
 def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     """Estimate the base parameters by joint smoothing of all logs, from the machine file's values.
 
     Encoders that beat with the clock keep their weight, which keeps the estimate unbiased; the standard deviations
-    account for the beats. If no unbiased fit is found, a slightly biased one is returned with a note. If the
-    innovations show that the model does not explain a log, or exact dynamics give no fit, friction may stick (see
-    `_fit_sticking`); if that does not explain it either, the model gets as much process noise as needed, and a note.
+    account for the beats. If the model does not explain the logs (see `joint_exactly`), forces that it lacks are
+    estimated beside the parameters (see `joint_beside_forces`).
 
-    Raises NotConvergedError if that fails too, NotIdentifiableError if a torque is missing.
+    Raises NotConvergedError if there is no motion to begin with, NotIdentifiableError if a torque is missing.
     """
-    space = build_state_space(model, common_sensors(model, logs))
-    measurements, starts = prepare_logs(space, logs, filter, unbiased=True)
-    weighted = [replace(data, unbiased=False) for data in measurements]
+    try:
+        return joint_exactly(model, logs, filter)
+    except UnexplainedError:
+        return joint_beside_forces(model, logs, filter)
+
+
+def joint_exactly(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
+    """Estimate by joint smoothing if the model alone explains the logs.
+
+    It does if no sensor's innovations are larger than noise and the marginal likelihood says that no force is lacking.
+    If not, friction may stick (see `_fit_sticking`). Raises UnexplainedError if neither explains the logs.
+    """
+    space, measurements, starts, held = _prepare(model, logs, filter)
+    readings = sum(float(data.used.sum()) for data in measurements)
+    limit = Settings(cost_limit=LOST_COST_RATIO * readings)
+    fit = fit_logs(space, measurements, starts, model.nominal, starts, held, settings=limit)
+    close = fit.step <= CLOSE_STEP and not find_suspect_sensors(space, logs, fit)
+    if (not close or shows_sticking(model, logs, filter, fit)) and (stuck := _fit_sticking(model, logs, filter, held)):
+        return stuck
+    if not close or lacks_forces(space, measurements, starts, held, fit):
+        raise UnexplainedError("the model alone does not explain the log", fit if fit.linear else None)
+    fit, one_sided, flat_notes = quantify_uncertainty(space, measurements, starts, fit)
+    notes = (*describe_noise(space, measurements), *flat_notes)
+    return _build_estimate(space, measurements, fit, filter, notes, one_sided)
+
+
+def joint_beside_forces(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
+    """Estimate beside forces that the model lacks (`excite.smoothing.fit_unknown_forces`); a note tells their size.
+
+    If no such forces are found, the model has process noise. The estimate is doubtful. Raises NotConvergedError.
+    """
+    space, measurements, starts, held = _prepare(model, logs, filter)
     notes = describe_noise(space, measurements)
-    held = identifiability.parameters_at_rest(model, logs, filter, slow=False)
+    around = fit_unknown_forces(space, measurements, starts, held)
+    if around.fit.step > ACCEPTABLE_STEP:  # a straight drive tells a mass from unknown forces poorly
+        weighted = [replace(data, unbiased=False) for data in measurements]
+        for level in PROCESS_NOISE_LEVELS:
+            noisy = fit_logs(space, weighted, starts, model.nominal, starts, held, level)
+            if noisy.status == "converged":
+                return replace(_build_estimate(space, weighted, noisy, filter, notes), doubt=UNEXPLAINED_DOUBT)
+    found = around.fit if around.fit.linear else around.fit.required()
+    missing = describe_missing(space, found.unknown, found.trajectories)
+    told = [f"{m.name} {format_number(m.rms, 2)} {m.unit}" for m in missing]
+    note = f"what the model does not explain, rms along the logs: {'; '.join(told)}"
+    estimate = _build_estimate(space, around.measurements, found, filter, (*notes, note))
+    moving = "" if found.step <= ACCEPTABLE_STEP else f"; {STALLED_DOUBT.format(format_number(found.step, 2))}"
+    return replace(estimate, doubt=UNEXPLAINED_DOUBT + moving, discrepancy=_discrepancy(missing))
 
-    def ways() -> Iterator[tuple[np.ndarray, bool]]:
-        yield held, False
-        held_if_slow = held | identifiability.parameters_at_rest(model, logs, filter, slow=True)
-        differs = (held_if_slow & ~held).any()
-        if differs:
-            yield held_if_slow, False
-        # With process noise the iteration converges from further away.
-        yield held, True
-        if differs:
-            yield held_if_slow, True
 
-    stuck: Estimate | None = None
-    failure: NotConvergedError | None = None
-    noisy_fit: Fit | None = None
-    suspect_fit: tuple[tuple[bool, float], Fit, np.ndarray, list[str]] | None = None
-    for held_now, with_noise in ways():
-        try:
-            if with_noise:
-                noisy_fit = fit_with_process_noise(space, logs, weighted, starts, model.nominal, starts, held_now)
-            trajectories, X = (starts, model.nominal) if noisy_fit is None else (noisy_fit.trajectories, noisy_fit.X)
-            fit, bias_notes = _fit_exact(space, measurements, weighted, trajectories, X, starts, held_now)
-        except NotConvergedError as failed:
-            if failure is None and (stuck := _fit_sticking(model, logs, filter, held_now)):
-                return stuck
-            failure = failure or failed
-            continue
-        suspects = find_suspect_sensors(space, logs, fit)
-        sticks = bool(suspects) or shows_sticking(model, logs, filter, fit)
-        if sticks and failure is None and (stuck := _fit_sticking(model, logs, filter, held_now)):
-            return stuck
-        if not suspects:
-            if bias_notes:
-                return _build_estimate(space, measurements, fit, filter, (*notes, *bias_notes))
-            fit, one_sided, flat_notes = quantify_uncertainty(space, measurements, starts, fit)
-            return _build_estimate(space, measurements, fit, filter, (*notes, *flat_notes), one_sided)
-        rank = bool(bias_notes), fit.cost  # only costs of the same measurements are comparable
-        if suspect_fit is None or rank < suspect_fit[0]:
-            suspect_fit = rank, fit, held_now, suspects
-        if held_now is held:
-            break  # no parameter was held, so the model is the cause
-    reason = str(failure)
-    if suspect_fit is not None:
-        _, fit, held_now, suspects = suspect_fit
-        reason = "; ".join(suspects)
-        try:
-            noisy_fit = fit_with_process_noise(space, logs, weighted, fit.trajectories, fit.X, starts, held_now)
-        except NotConvergedError as failed:
-            failure = failed
-    if noisy_fit is None:
-        assert failure is not None
-        raise failure
-    estimate = _build_estimate(space, measurements, noisy_fit, filter, (*notes, reason))
-    return replace(estimate, doubt=UNEXPLAINED_DOUBT)
+def _prepare(
+    model: Model, logs: Sequence[Log], filter: Filter
+) -> tuple[StateSpace, Sequence[Measurements], Sequence[Trajectory], np.ndarray]:
+    """Return the state space, measurements, first trajectories, and parameters (n_base,) of what is at rest."""
+    space = build_state_space(model, common_sensors(model, logs), bool(model.machine.contacts))
+    measurements, starts = prepare_logs(space, logs, filter, unbiased=True)
+    return space, measurements, starts, identifiability.parameters_at_rest(model, logs, filter, slow=False)
+
+
+def _discrepancy(missing: Sequence[Missing]) -> tuple[Discrepancy, ...]:
+    """Return what is missing as an estimate states it: place, what it follows, rms and unit."""
+    return tuple(Discrepancy(m.place, m.follows, m.rms, m.unit, m.scale) for m in missing)
+
+
+STALLED_DOUBT = "no better values were found, yet the next step is {} standard deviations long"
 
 
 def shows_sticking(model: Model, logs: Sequence[Log], filter: Filter, fit: Fit) -> bool:
@@ -150,70 +159,17 @@ def _fit_sticking(model: Model, logs: Sequence[Log], filter: Filter, held: np.nd
     soft, extra = rests
     space = build_state_space(soft, common_sensors(soft, logs))
     measurements, starts = prepare_logs(space, logs, filter, unbiased=True, extra_torque_noise=extra)
-    weighted = [replace(data, unbiased=False) for data in measurements]
-    try:
-        fit, bias_notes = _fit_exact(space, measurements, weighted, starts, model.nominal, starts, held)
-        if find_suspect_sensors(space, logs, fit):
-            return None
-        fit, one_sided, flat_notes = quantify_uncertainty(space, measurements, starts, fit)
-    except NotConvergedError:
+    fit = fit_logs(space, measurements, starts, model.nominal, starts, held)
+    if fit.step > CLOSE_STEP or find_suspect_sensors(space, logs, fit):
         return None
+    fit, one_sided, flat_notes = quantify_uncertainty(space, measurements, starts, fit)
     share = float(np.mean([np.mean(x > 0) for x in extra]))
     note = (
         f"friction sticks in this log: in the {format_number(100 * share, 2)} % of it in which a joint is near rest,"
         " the friction may have any value up to Fs"
     )
-    notes = (*describe_noise(space, measurements), *bias_notes, *flat_notes, note)
+    notes = (*describe_noise(space, measurements), *flat_notes, note)
     return _build_estimate(space, measurements, fit, filter, notes, one_sided)
-
-
-def _fit_exact(
-    space: StateSpace,
-    measurements: Sequence[Measurements],
-    weighted: Sequence[Measurements],
-    trajectories: Sequence[Trajectory],
-    X: np.ndarray,
-    starts: Sequence[Trajectory],
-    held: np.ndarray,
-) -> tuple[Fit, tuple[str, ...]]:
-    """Fit with exact dynamics, unbiased if possible; return the fit and its notes. Raises NotConvergedError."""
-    failure: NotConvergedError | None = None
-    for chosen, notes in ((measurements, ()), (weighted, (BIASED_NOTE,))):
-        try:
-            return fit_logs(space, chosen, trajectories, X, starts, 0.0, held), notes
-        except NotConvergedError as failed:
-            if failed.fit is not None and failed.step < ACCEPTED_STEP:
-                return failed.fit, notes
-            failure = failure or failed
-    assert failure is not None
-    raise failure
-
-
-def fit_with_process_noise(
-    space: StateSpace,
-    logs: Sequence[Log],
-    measurements: Sequence[Measurements],
-    trajectories: Sequence[Trajectory],
-    X: np.ndarray,
-    starts: Sequence[Trajectory],
-    held: np.ndarray,
-) -> Fit:
-    """Fit with the lowest level of process noise that explains the innovations. Raises NotConvergedError."""
-    failure: NotConvergedError | None = None
-    fit: Fit | None = None
-    for level in PROCESS_NOISE_LEVELS:
-        try:
-            fit = fit_logs(space, measurements, trajectories, X, starts, level, held)
-        except NotConvergedError as failed:
-            failure = failed
-            continue
-        if not find_suspect_sensors(space, logs, fit):
-            return fit
-        trajectories, X = fit.trajectories, fit.X
-    if fit is None:
-        assert failure is not None
-        raise failure
-    return fit
 
 
 def _build_estimate(
@@ -251,6 +207,8 @@ def _build_estimate(
     # Blocks that fit the cache are ten times faster than all rows at once.
     triangles = [np.linalg.qr(w, mode="r") for rows in W for w in np.array_split(rows, 40)]
     R: np.ndarray = np.asarray(np.linalg.qr(np.concatenate(triangles), mode="r"))
+    own = [k for k, n in enumerate(model.base.names) if f"effect.{n}" not in model.known.quantities]  # no tolerances
+    size_of_own = np.maximum(np.abs(fit.X), [float(model.machine.scale.get(n, 0.0)) for n in model.base.names])[own]
     names, units, free = model.base.names, model.base.units, np.flatnonzero(~fit.unidentifiable).tolist()
     reasons = {
         name: describe_combinations(R, model.scale, names, units, fit.X, fit.covariance, k, [j for j in free if j != k])
@@ -266,12 +224,8 @@ def _build_estimate(
         model.base.units,
         np.where(weak, np.nan, fit.X),
         covariance,
-        float(np.linalg.cond(R)),
-        float(
-            np.linalg.cond(
-                R * np.maximum(np.abs(fit.X), [float(model.machine.scale.get(n, 0.0)) for n in model.base.names])
-            )
-        ),
+        float(np.linalg.cond(R[:, own])),
+        float(np.linalg.cond(R[:, own] * size_of_own)),
         100 * float(np.linalg.norm(residual)) / size if size else np.nan,
         residual,
         int(sum(data.used.sum() for data in measurements)) - len(fit.X),
@@ -279,6 +233,7 @@ def _build_estimate(
         notes,
         one_sided_std=None if one_sided is None else np.where(weak, np.nan, one_sided),
         share_outside_law=float(np.concatenate(outside).mean()),
+        smoothed=() if fit.unknown.count else tuple((space, one) for one in fit.trajectories),
     )
 
 

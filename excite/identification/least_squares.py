@@ -131,7 +131,7 @@ def solve(triangle: Triangle, tolerance: float = DEPENDENCE_TOLERANCE, scale: np
     scaled = A / np.where(size > 0, size, 1.0)
     kept, dropped = independent_columns(scaled, tolerance)
     if scale is not None:
-        kept = exchange_columns(A * scale, kept, dropped)
+        kept = [k for k in exchange_columns(A * scale, kept, dropped) if size[k] > 0]
     dependent: dict[int, int | None] = {
         k: kept[int(np.argmax(np.abs(scaled[:, kept].T @ scaled[:, k])))] if size[k] > 0 else None
         for k in range(n)

@@ -1,4 +1,4 @@
-"""Linear methods on the filtered rows of logs: ordinary, weighted and total least squares."""
+"""Ordinary least squares on the filtered rows of logs."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from excite.errors import NotIdentifiableError
 from excite.identification.combinations import describe_combinations
 from excite.identification.estimate import NOTHING_MOVES_MESSAGE, Estimate, held_note
 from excite.identification.identifiability import rest_projection
+from excite.identification.inverse_estimate import recommend_method
 from excite.identification.least_squares import (
     Solution,
     Triangle,
@@ -22,24 +23,14 @@ from excite.identification.least_squares import (
     scores_covariance,
     solve,
 )
-from excite.identification.near_rest import Block as Block, leave_out, moving_rows
-from excite.identification.noise_propagation import (
-    MIN_ROW_NOISE,
-    filtered_noise,
-    row_errors,
-    row_levels,
-    second_moments,
-    whitening_matrices,
-)
-from excite.logs import Log, filtered_regression, samples
+from excite.logs import Log, filtered_regression
 from excite.model import Model
 from excite.model.machine import Filter
-from excite.text import count, format_number
+from excite.text import count
 
-MAX_REWEIGHTINGS = 30  # of the iteration for weights; chosen
-SETTLED_WEIGHTS = 1e-4  # relative change of the weights that ends it; chosen
-MAX_REST_SHIFT = 2.0  # standard deviations by which rows near rest may move an estimate; chosen
 NOTABLE_STD_RATIO = 1.2  # ratio of robust to textbook standard deviations that is reported; chosen
+
+Block = tuple[np.ndarray, np.ndarray]  # W (n_rows, n, n_base) and Y (n_rows, n) of one log
 
 
 def ols(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
@@ -54,96 +45,8 @@ def ols(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     solution = solve_blocks(blocks, model.scale)
     estimate = estimate_with_white_noise(model, blocks, solution, "ols")
     robust = sandwich_covariance(model, blocks, solution)
-    doubt, factor = _autocorrelation_doubt(blocks, solution, model.base.names, robust)
+    doubt, factor = _autocorrelation_doubt(model, blocks, solution, robust)
     return replace(estimate, doubt=doubt, understated=factor)
-
-
-def wls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
-    """Estimate by weighted least squares, each equation weighted by its residual level, iterated.
-
-    No level is below the sensor noise propagated at the machine file's values: a row without torque fits best with
-    parameters near zero and would gain all the weight. Rows of joints near rest are left out if they contradict others.
-    Standard deviations account for autocorrelation and for noise that varies along the log. Biased like `ols` if the
-    regressor is noisy, but less if noisy rows have less weight.
-    """
-    every = filtered_blocks(model, logs, filter)
-    in_motion = rows_to_trust(model, logs, filter, every)
-    moving, notes = rows_in_motion(model, every, in_motion)
-    blocks = leave_out(every, moving)
-    lowest = row_levels([row_errors(model, log, filter, 1) for log in logs], model.nominal, in_motion)
-    lowest = np.maximum(lowest, MIN_ROW_NOISE * rms_torque(blocks))  # logs without noise have no residual
-    count = np.maximum(sum(_used(b).sum(axis=1) for b in blocks), 1)
-    level, weighted = lowest, scale_rows(blocks, lowest)
-    for _ in range(MAX_REWEIGHTINGS):
-        solution = solve_blocks(weighted, model.scale)
-        energy = sum((residual(b, solution.x) ** 2).sum(axis=1) for b in blocks)
-        before, level = level, np.maximum(np.sqrt(energy / count), lowest)
-        if np.abs(level / before - 1).max() < SETTLED_WEIGHTS:
-            break
-        weighted = scale_rows(blocks, level)
-    covariance = sandwich_covariance(model, weighted, solution)
-    degrees = effective_degrees(solution, covariance)
-    x = restore_tied_parameters(model, blocks, solution, solution.x)
-    return build_estimate(model, every, solution, "wls", x, covariance, degrees, notes)
-
-
-def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
-    """Estimate by total least squares with the noise covariance of every column (errors in variables).
-
-    Rows are whitened at the machine file's values (see `whitening_matrices`). The noise covariance C of [W Y], summed
-    over rows, comes from simulated readings of the filtered log. With the smallest l in [W Y]'[W Y] v = l C v, the
-    estimate solves (W'W - l C_WW) X = W'Y - l C_WY. It is consistent for any size of the noise if C has the right shape
-    (Van Huffel and Vandewalle, "The total least squares problem", 1991, ch. 10). Raises NotIdentifiableError if no
-    signal has noise, or if the noise hides every parameter.
-    """
-    every = filtered_blocks(model, logs, filter)
-    moving, notes = rows_in_motion(model, every, rows_to_trust(model, logs, filter, every))
-    blocks = leave_out(every, moving)
-    first = solve_blocks(blocks, model.scale)
-    whitening = [
-        whitening_matrices(
-            model, samples(model, log, filter), model.nominal, filtered_noise(model, log, filter), filter
-        )
-        for log in logs
-    ]
-    whitened = [whiten_block(b, L) for b, L in zip(blocks, whitening, strict=True)]
-    errors = [
-        [np.einsum("nij,jnp->inp", L, E * _used(b)[:, :, None]) for E in row_errors(model, log, filter)]
-        for log, L, b in zip(logs, whitening, blocks, strict=True)
-    ]
-    kept = list(first.kept)
-    use = [*kept, len(model.base.names)]
-    C = second_moments(errors)[np.ix_(use, use)]
-    R = np.asarray(np.linalg.qr(reduce_blocks(whitened).R[:, use], mode="r"))
-    half = scipy.linalg.solve_triangular(R, C, trans="T")
-    relative = scipy.linalg.solve_triangular(R, half.T, trans="T")
-    mu, v = np.linalg.eigh((relative + relative.T) / 2)
-    if not mu[-1] > 0:
-        raise NotIdentifiableError(
-            "tls: no signal of this log has noise or counts, so the noise is unknown: use another method"
-        )
-    direction = scipy.linalg.solve_triangular(R, v[:, -1])
-    x = np.zeros(len(model.base.names))
-    x[kept] = -direction[:-1] / direction[-1]
-    level = 1 / float(mu[-1])
-    bread = np.linalg.inv(R[:, :-1].T @ R[:, :-1] - level * C[:-1, :-1])
-    covariance = robust_covariance(model, bread, whitened, x, kept)
-    if (np.sqrt(np.diag(covariance)) > np.abs(x[kept])).all():
-        raise NotIdentifiableError(
-            "tls: noise in the regressor hides every parameter, as slips from encoders do: use another method"
-        )
-    note = f"tls: misfit {np.sqrt(level):.2f} times what the sensors' noise and counts explain"
-    x = restore_tied_parameters(model, blocks, first, x)
-    return build_estimate(
-        model,
-        every,
-        first,
-        "tls",
-        x,
-        covariance,
-        effective_degrees(solve_blocks(whitened, model.scale), covariance),
-        (*notes, note),
-    )
 
 
 # ------------------------------------------------------------------------------------------------ equations
@@ -151,61 +54,9 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
 
 def filtered_blocks(model: Model, logs: Sequence[Log], filter: Filter) -> list[Block]:
     """Filter the rows of every log; parts at rest in all logs are exactly at rest."""
+    blocks = [filtered_regression(model, log, filter) for log in logs]
     projection = rest_projection(model, logs, filter)
-    return project_blocks([filtered_regression(model, log, filter) for log in logs], projection)
-
-
-def rows_to_trust(model: Model, logs: Sequence[Log], filter: Filter, blocks: Sequence[Block]) -> list[np.ndarray]:
-    """Find the rows (n_rows, n) of each log that are not of joints near rest.
-
-    Machines with slips keep all rows: a selection by noisy slips would bias the estimate.
-    """
-    if model.slips:
-        return [np.ones(Y.shape, bool) for _, Y in blocks]
-    return [moving_rows(model, log, filter) for log in logs]
-
-
-def rows_in_motion(
-    model: Model, blocks: Sequence[Block], moving: list[np.ndarray]
-) -> tuple[list[np.ndarray], tuple[str, ...]]:
-    """Find the rows (n_rows, n) of each log to use, with a note.
-
-    moving: see `rows_to_trust`. Rows of joints near rest are left out if they move an estimate by more than noise
-    explains (test of J. A. Hausman, Econometrica 46, 1978), and every parameter is identified without them.
-    """
-    every = [np.ones(Y.shape, bool) for _, Y in blocks]
-    share = 1 - float(np.mean(np.concatenate(moving, axis=1)))
-    if not share:
-        return every, ()
-    whole = solve_blocks(blocks, model.scale)
-    count = sum(Y.shape[1] for _, Y in blocks)
-    level = np.sqrt(sum((residual(b, whole.x) ** 2).sum(axis=1) for b in blocks) / count)
-    weighted = scale_rows(blocks, np.where(level > 0, level, 1.0))
-    rest = leave_out(weighted, moving)
-    with_rest, without = (solve(reduce_blocks(b), scale=model.scale) for b in (weighted, rest))
-    kept = list(without.kept)
-    if kept != list(with_rest.kept):
-        return every, ()
-    shift = (with_rest.x - without.x)[kept] / np.sqrt(np.diag(sandwich_covariance(model, rest, without)))
-    if not np.abs(shift).max(initial=0.0) > MAX_REST_SHIFT:
-        return every, ()
-    worst = int(np.argmax(np.abs(shift)))
-    note = (
-        f"friction sticks in this log: {format_number(100 * share, 2)} % of the rows are of joints near rest and are"
-        f" left out; they would move {model.base.names[kept[worst]]} by {abs(shift[worst]):.0f} standard deviations"
-    )
-    return moving, (note,)
-
-
-def _used(block: Block) -> np.ndarray:
-    """Find the rows (n_rows, n) that are not left out."""
-    W, Y = block
-    return np.asarray(W.any(axis=2) | (Y != 0))
-
-
-def project_blocks(blocks: Sequence[Block], projection: np.ndarray) -> list[Block]:
-    """Apply a `rest_projection` (n_base, n_base) to the regressors."""
-    return [(W @ projection, Y) for W, Y in blocks] if (np.diag(projection) == 0).any() else list(blocks)
+    return [(W @ projection, Y) for W, Y in blocks] if (np.diag(projection) == 0).any() else blocks
 
 
 def restore_tied_parameters(model: Model, blocks: Sequence[Block], solution: Solution, x: np.ndarray) -> np.ndarray:
@@ -273,11 +124,6 @@ def reduce_blocks(blocks: Sequence[Block]) -> Triangle:
     return merge(reduce(w, y) for W, Y in blocks for w, y in zip(W, Y, strict=True))
 
 
-def scale_rows(blocks: Sequence[Block], level: np.ndarray) -> list[Block]:
-    """Divide rows by their levels (n_rows,)."""
-    return [(W / level[:, None, None], Y / level[:, None]) for W, Y in blocks]
-
-
 def whiten_block(block: Block, L: np.ndarray) -> Block:
     """Multiply the rows of each sample by L (n, n_rows, n_rows)."""
     W, Y = block
@@ -295,44 +141,23 @@ def residual(block: Block, x: np.ndarray) -> np.ndarray:
     return np.asarray(Y - W @ x)
 
 
-def robust_covariance(
-    model: Model,
-    bread: np.ndarray,
-    blocks: Sequence[Block],
-    x: np.ndarray,
-    kept: Sequence[int],
-    instruments: Sequence[np.ndarray] = (),
-) -> np.ndarray:
-    """Covariance (k, k) of the estimate bread Z'(Y - W x) for residuals of any autocorrelation and varying level.
+def sandwich_covariance(model: Model, blocks: Sequence[Block], solution: Solution) -> np.ndarray:
+    """Covariance (k, k) of a least-squares estimate for residuals of any autocorrelation and varying level.
 
-    bread (k, k). instruments: Z (n_rows, n, n_base) of each log, by default W. Residuals are noise that is correlated
-    over a few samples (`scores_covariance`), and structure that the model lacks, which lasts longer (`cluster_scores`):
-    each parameter has the larger of the two standard deviations. With slips the noise of the regressor prevails, whose
-    scores have no mean of zero within a stretch, so the second is left out.
+    Residuals are noise that is correlated over a few samples (`scores_covariance`), and structure that the model lacks,
+    which lasts longer (`cluster_scores`): each parameter has the larger of the two standard deviations. With slips the
+    noise of the regressor prevails, whose scores have no mean of zero within a stretch, so the second is left out.
     """
+    bread, kept = solution.inverse, list(solution.kept)
     rows = sum(Y.size for _, Y in blocks)
-    Z = [z[:, :, list(kept)] for z in instruments or [W for W, _ in blocks]]
-    errors = [residual(b, x) for b in blocks]
+    pairs = [(W[:, :, kept], residual((W, Y), solution.x)) for W, Y in blocks]
     kinds = (scores_covariance,) if model.slips else (scores_covariance, cluster_scores)
-    sums = [sum(scores(z, e) for z, e in zip(Z, errors, strict=True)) for scores in kinds]
-    short, *long = (bread @ S @ bread.T for S in sums)
+    short, *long = (bread @ sum(scores(w, e) for w, e in pairs) @ bread.T for scores in kinds)
     variance = np.diag(short)
     ratio = np.ones(len(variance))
     for other in long:
         ratio = np.sqrt(np.maximum(np.diag(other) / np.where(variance > 0, variance, np.inf), 1.0))
     return np.asarray(short * np.outer(ratio, ratio) * (rows / (rows - len(kept))))
-
-
-def sandwich_covariance(model: Model, blocks: Sequence[Block], solution: Solution) -> np.ndarray:
-    """Robust covariance (k, k) of a least-squares estimate."""
-    return robust_covariance(model, solution.inverse, blocks, solution.x, solution.kept)
-
-
-def effective_degrees(solution: Solution, covariance: np.ndarray) -> int:
-    """Degrees of freedom left by autocorrelation: rows over the variance inflation, minus parameters."""
-    white = solution.residual_norm**2 / solution.degrees * np.diag(solution.inverse)
-    inflation = max(1.0, float(np.median(np.diag(covariance) / white)))
-    return max(3, int(solution.rows / inflation) - len(solution.kept))
 
 
 # ------------------------------------------------------------------------------------------------ estimates
@@ -424,7 +249,7 @@ def combine_with_known(
 
 
 def _autocorrelation_doubt(
-    blocks: Sequence[Block], solution: Solution, names: Sequence[str], robust: np.ndarray
+    model: Model, blocks: Sequence[Block], solution: Solution, robust: np.ndarray
 ) -> tuple[str, float]:
     """Say by which factor standard deviations by (33) are too small for autocorrelated residuals, "" and 1 if not."""
     kept = list(solution.kept)
@@ -434,8 +259,9 @@ def _autocorrelation_doubt(
         return "", 1.0
     correlation = max((float(np.abs(lag_one_correlation(residual(b, solution.x))).max()) for b in blocks), default=0.0)
     worst = int(np.argmax(ratio))
+    name, better = model.base.names[kept[worst]], recommend_method(model)
     doubt = (
         f"residuals are autocorrelated (lag 1: {correlation:.2f}), so standard deviations by (33) are too small by a"
-        f" factor of up to {ratio[worst]:.1f} ({names[kept[worst]]}): --method wls states what holds"
+        f" factor of up to {ratio[worst]:.1f} ({name}): --method {better} states what holds"
     )
     return doubt, float(ratio[worst])

@@ -11,14 +11,14 @@ import numpy as np
 
 from excite.errors import MachineError, NoEstimateError, NotIdentifiableError
 from excite.identification import bias
+from excite.identification.assessment import estimate_in_full
 from excite.identification.bias import Estimator
 from excite.identification.encoder_errors import correct_angles, is_encoder_error
 from excite.identification.estimate import Estimate, add_notes, held_note
 from excite.identification.identifiability import add_advice
-from excite.identification.instrumental_variables import iv
-from excite.identification.joint import joint
-from excite.identification.linear_methods import filtered_blocks, ols, tls, wls
-from excite.identification.output_error import oe
+from excite.identification.inverse_estimate import inverse
+from excite.identification.joint import joint, joint_beside_forces, joint_exactly
+from excite.identification.linear_methods import filtered_blocks, ols
 from excite.identification.status import assess
 from excite.logs import NEEDED, Log, doubts_in_errors, examine, planar_speed_sensors, samples, unmeasured
 from excite.model import Model, with_given_zeros
@@ -27,8 +27,8 @@ from excite.simulation import outside_law
 from excite.text import format_number
 
 RATIOS_NOTE = (
-    "no torque constant is given, so torques are currents and every value is divided by that constant (N m/A at the"
-    " joint, or N/A), the same for all drives; give torque_constant to get SI values"
+    "no torque constant is given, so every value is divided by that constant, the torque or force per {} before the"
+    " gear, the same for all drives; give torque_constant to get SI values, or call a load known to get that constant"
 )
 
 
@@ -36,6 +36,7 @@ RATIOS_NOTE = (
 class Method:
     """An identification method: a function(model, logs, filter) that returns an Estimate.
 
+    exact: the same if the model alone explains the logs, for methods that know that; otherwise: where it doesn't.
     effects: which it estimates beside the base parameters: none, those linear in the equations of motion, or any.
     simulates: finds an unmeasured speed from the dynamics. reads: kinds of sensor that it uses beside those of
         `LINEAR_KINDS`. biased: noisy slips bias it, so `excite identify` estimates
@@ -43,11 +44,12 @@ class Method:
     """
 
     find: Estimator
+    exact: Estimator | None = None
+    otherwise: Estimator | None = None
     effects: Literal["none", "linear", "any"] = "none"
     simulates: bool = False
     reads: tuple[str, ...] = ()
     biased: bool = False
-    optimistic: bool = False
 
 
 def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Filter | None = None) -> Estimate:
@@ -85,7 +87,9 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
                 " logs tell ratios only: call one value of the machine file known, other than zero, to get all others"
             )
         try:
-            estimate = add_advice(model, repaired, METHODS[method].find(model, repaired, filter), filter)
+            chosen = METHODS[method]
+            estimate = estimate_in_full(chosen.otherwise or chosen.find, chosen.exact, model, repaired, filter)
+            estimate = add_advice(model, repaired, estimate, filter)
         except np.linalg.LinAlgError:
             raise NotIdentifiableError(
                 f"{repaired[0].source}: the equations of {method} are singular along this log: check the sign and unit"
@@ -93,15 +97,12 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
             ) from None
     if METHODS[method].effects == "linear":
         estimate = _with_known_encoder_errors(model, estimate)
-    if METHODS[method].optimistic and model.slips and not estimate.doubt:
-        doubt = f"slips from real encoders are noisy, and the intervals of {method} are too narrow then: use joint"
-        estimate = replace(estimate, doubt=doubt)
     if starts := _unknown_starts(model):
         estimate = add_notes(estimate, starts) if estimate.doubt else replace(estimate, doubt=starts)
     estimate = assess(model, repaired, estimate, filter)
     if estimate.share_outside_law is None:
         estimate = replace(estimate, share_outside_law=_share_outside_law(model, repaired, filter, estimate))
-    ratios = (RATIOS_NOTE,) if model.machine.in_ratios else ()
+    ratios = (RATIOS_NOTE.format(model.machine.torque_unit),) if model.machine.in_ratios else ()
     unused = unused_sensors(model, method, repaired)
     said = [f"{method} does not use {', '.join(unused)}"] if unused else []
     return add_notes(estimate, *ratios, *said, *(note for e in examined for note in e.notes), *doubts)
@@ -202,7 +203,8 @@ def _require_method_for_effects(model: Model, method: str) -> None:
     supported = METHODS[method].effects
     if model.plain or supported == "any":
         return
-    machine, others = model.machine.name, " or ".join(name for name, m in METHODS.items() if m.effects != "none")
+    usable = (n for n, m in METHODS.items() if m.effects != "none" and (m.find is not inverse or model.fully_driven))
+    machine, others = model.machine.name, " or ".join(usable)
     if supported == "none":
         raise MachineError(f"{machine}: effect: method {method} doesn't know effects, use {others}")
     for e in model.effects:
@@ -218,8 +220,8 @@ def add_bias(
 ) -> Estimate:
     """Add the bias of the method on these logs, from simulated ones (see `bias.add_bias`).
 
-    The simulated machine is that of joint smoothing, or of instrumental variables, if one of them finds it. Least
-    squares may be so far off that its own machine does not show the bias.
+    The simulated machine is that of joint smoothing, if this finds one. Least squares may be so far off that its own
+    machine does not show the bias.
     """
     if not model.plain:
         return add_notes(
@@ -229,19 +231,9 @@ def add_bias(
     filter = filter or model.machine.filter
     around: np.ndarray | None = None
     if METHODS[estimate.method].biased:
-        for find in (METHODS["joint"].find, iv):
-            with suppress(NoEstimateError):
-                around = find(model, logs, filter).value
-                break
+        with suppress(NoEstimateError):
+            around = joint(model, logs, filter).value
     return bias.add_bias(model, logs, estimate, METHODS[estimate.method].find, filter, around, runs)
-
-
-def recommend_method(model: Model) -> str:
-    """Recommend joint smoothing for a machine with effects, or with a noisy regressor, else wls.
-
-    Slips are noisy, and so are springs between joints, which bend by small differences of two angles.
-    """
-    return "joint" if model.slips or model.machine.joined_by_springs or not model.plain else "wls"
 
 
 def needed_sensors(model: Model, method: str) -> tuple[str, ...]:
@@ -337,15 +329,19 @@ MAX_LINEARISATIONS = 20  # of a linear method for encoder zeros; chosen
 SETTLED_STEP = 0.01  # standard deviations; chosen
 LINEAR_KINDS = ("angle", "torque", "wheel", "forward_speed", "lateral_speed")  # of sensors that every method uses
 LINEAR_METHODS: dict[str, Method] = {
+    "inverse": Method(inverse, effects="linear"),
     "ols": Method(relinearise(ols), effects="linear", biased=True),
-    "wls": Method(relinearise(wls), biased=True),
-    "iv": Method(relinearise(iv), simulates=True, optimistic=True),
-    "tls": Method(relinearise(tls), optimistic=True),
 }
 METHODS: dict[str, Method] = {
     **LINEAR_METHODS,
-    "oe": Method(oe, simulates=True, reads=("yaw_rate",)),
-    "joint": Method(joint, effects="any", simulates=True, reads=("yaw_rate", "ground_speed", "x", "y")),
+    "joint": Method(
+        joint,
+        joint_exactly,
+        joint_beside_forces,
+        effects="any",
+        simulates=True,
+        reads=("yaw_rate", "ground_speed", "x", "y"),
+    ),
     **{
         f"{name}+consistent": replace(m, find=restrict_to_possible(m.find), effects="none")
         for name, m in LINEAR_METHODS.items()

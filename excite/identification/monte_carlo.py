@@ -124,7 +124,7 @@ def _run(
         estimate = identify_table(build_cached(assumed_json), table, method)
     except NoEstimateError as err:
         return k, None, str(err)
-    return k, (estimate.value, estimate.std, estimate.interval95), ""
+    return k, (estimate.value, estimate.std, estimate.noise_interval95), ""
 
 
 def identify_table(model: Model, table: pd.DataFrame, method: str) -> Estimate:

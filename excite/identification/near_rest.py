@@ -21,8 +21,6 @@ SATURATION = 3.0  # tanh(3) = 0.995: how far friction has its full size where a 
 EDGE = 2  # samples to both sides of a joint near rest that count as near rest, too; chosen
 REACH = 3  # kept rows to both sides that the decimation's low-pass spreads a row over; chosen
 
-Block = tuple[np.ndarray, np.ndarray]  # W (n_rows, n, n_base) and Y (n_rows, n) of one log
-
 
 def moving_rows(model: Model, log: Log, filter: Filter) -> np.ndarray:
     """Find the rows (n_rows, n) of a filtered log that are not those of a joint near rest."""
@@ -79,8 +77,3 @@ def sticking(model: Model, logs: Sequence[Log], filter: Filter) -> tuple[Model, 
     """
     size = [friction_near_rest(model, log, filter) for log in logs]
     return (with_soft_friction(model, logs, filter), size) if any(x.any() for x in size) else None
-
-
-def leave_out(blocks: Sequence[Block], moving: Sequence[np.ndarray]) -> list[Block]:
-    """Set rows near rest to zero; rows of a log without motion are all left in."""
-    return [(W * m[:, :, None], Y * m) for (W, Y), m in zip(blocks, moving, strict=True)]

@@ -117,13 +117,3 @@ def row_levels(errors: Sequence[list[np.ndarray]], x: np.ndarray, used: Sequence
     square = sum(((E @ v) ** 2 * own).sum(axis=1) for log, own in zip(errors, used, strict=True) for E in log)
     count = sum(own.sum(axis=1) * len(log) for log, own in zip(errors, used, strict=True))
     return np.asarray(np.sqrt(square / np.maximum(count, 1)))
-
-
-def second_moments(errors: Sequence[list[np.ndarray]]) -> np.ndarray:
-    """Second moments (n_base + 1, n_base + 1) of errors of [W Y], summed over rows and logs, averaged over readings."""
-    total = np.zeros((errors[0][0].shape[2],) * 2)
-    for log in errors:
-        for E in log:
-            flat = E.reshape(-1, E.shape[2])
-            total += flat.T @ flat / len(log)
-    return total

@@ -153,9 +153,9 @@ def predict_motion(model: Model, drive: PlannedDrive, estimate: Estimate) -> Pre
 def _complete(model: Model, estimate: Estimate) -> tuple[Estimate, tuple[str, ...]]:
     """Fill in the machine file's values of unidentified parameters, without uncertainty, and name these parameters."""
     known = np.isfinite(estimate.value)
-    covariance = np.where(np.outer(known, known), np.nan_to_num(estimate.covariance), 0.0)
+    covariance = np.where(np.outer(known, known), np.nan_to_num(estimate.total_covariance), 0.0)
     assumed = tuple(n for n, k in zip(estimate.names, known, strict=True) if not k)
-    return replace(estimate, value=estimate.value_or(model.nominal), covariance=covariance), assumed
+    return replace(estimate, value=estimate.value_or(model.nominal), covariance=covariance, tolerated={}), assumed
 
 
 def _propagate(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,14 @@ import pandas as pd
 
 from excite import output
 from excite.errors import EstimateFolderError, MachineError
-from excite.identification.estimate import Estimate
+from excite.identification.estimate import Discrepancy, Estimate
 from excite.model import Model, build
 from excite.model.machine import Machine
 
 COVARIANCE = "covariance.csv"
+TOLERANCES = "tolerances.csv"
 MACHINE = "machine.json"
+MOST_SKEW = 1e-3  # difference of two correlations that are one; rounding makes less, also of a poor estimate; chosen
 AGAIN = "identify again with `excite identify MACHINE LOG`"
 
 
@@ -33,11 +35,15 @@ class SavedEstimate:
 def write_estimate(place: Path, model: Model, estimate: Estimate) -> None:
     """Write the machine, and the covariance [SI] with a row and a column a parameter, into a result folder.
 
-    Values and status are in the folder's summary. A parameter that was not identified has blank cells.
+    Tolerances have a row each: the shift [SI] of every parameter by one standard deviation of it. Values and status are
+    in the folder's summary. A parameter that was not identified has blank cells.
     """
     (place / MACHINE).write_text(model.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
     names = list(estimate.names)
-    pd.DataFrame(estimate.covariance, names, names).to_csv(place / COVARIANCE, index_label="parameter")
+    symmetric = (estimate.covariance + estimate.covariance.T) / 2
+    pd.DataFrame(symmetric, names, names).to_csv(place / COVARIANCE, index_label="parameter")
+    shifts = np.array(list(estimate.tolerated.values())).reshape(-1, len(names))
+    pd.DataFrame(shifts, list(estimate.tolerated), names).to_csv(place / TOLERANCES, index_label="source")
 
 
 def read_estimate(folder: Path) -> SavedEstimate:
@@ -61,6 +67,10 @@ def read_estimate(folder: Path) -> SavedEstimate:
         raise EstimateFolderError(f"{folder / MACHINE}: missing or damaged, {AGAIN}") from None
     try:
         estimate = _estimate(summary, pd.read_csv(folder / COVARIANCE, index_col="parameter"))
+        if (folder / TOLERANCES).is_file():
+            shifts = pd.read_csv(folder / TOLERANCES, index_col="source")
+            by_source = dict(zip(shifts.index, shifts[list(estimate.names)].to_numpy(float), strict=True))
+            estimate = replace(estimate, tolerated=by_source)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         raise EstimateFolderError(f"{folder}: {output.SUMMARY} or {COVARIANCE} is damaged, {AGAIN}") from None
     if estimate.names != model.base.names:
@@ -75,8 +85,12 @@ def _estimate(summary: dict[str, Any], covariance: pd.DataFrame) -> Estimate:
     if tuple(covariance.columns) != names or tuple(covariance.index) != names:
         raise ValueError("names differ")
     spread = covariance.to_numpy(float)
-    if np.isinf(spread).any() or not np.allclose(spread, spread.T, equal_nan=True):
+    std = np.sqrt(np.diag(spread))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        skew = np.abs(spread - spread.T) / np.outer(std, std)
+    if np.isinf(spread).any() or (np.isnan(spread) != np.isnan(spread.T)).any() or (skew > MOST_SKEW).any():
         raise ValueError("no covariance")
+    spread = (spread + spread.T) / 2
     return Estimate(
         str(summary["method"]),
         names,
@@ -91,5 +105,10 @@ def _estimate(summary: dict[str, Any], covariance: pd.DataFrame) -> Estimate:
         dict(summary["reasons"]),
         tuple(summary["notes"]),
         doubt=str(summary["doubt"]),
+        discrepancy=tuple(
+            Discrepancy(signal, str(d["kind"]), float(d["rms"]), str(own["unit"]), float(d["scale"]))
+            for signal, own in summary.get("discrepancy", {}).items()
+            for d in own["parts"]
+        ),
         status=str(summary["status"]),
     )

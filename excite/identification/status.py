@@ -11,6 +11,7 @@ import scipy
 
 from excite.errors import NotConsistentError
 from excite.identification.estimate import Estimate, add_notes
+from excite.identification.fit_tests import describe_failures
 from excite.logs import Log, samples
 from excite.model import Model, required_signs
 from excite.model.machine import Filter
@@ -36,6 +37,8 @@ UNIT_FACTORS = (
     (180 / math.pi, 2, 0.1, "is an angle in degrees where the machine file says radians, or the reverse?"),
     (30 / math.pi, 2, 0.03, "is a speed in rpm where the machine file says rad/s, or the reverse?"),
 )
+LEAST_GEAR = 2.0  # ratio from whose square on values off by it are no chance; chosen
+SQUARE_TOLERANCE = 0.2  # relative deviation of values from the square of a gear ratio; chosen
 CAUSES = "the sign of a torque or angle column, a unit, or a radius in the machine file"
 
 
@@ -58,21 +61,22 @@ def assess(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter
         else:
             with np.errstate(invalid="ignore"):
                 shift = np.abs(consistent - estimate.value)
-                moved &= shift > MOVED_STDS * estimate.std
-            far = shift > np.maximum(CLEAR_STDS * estimate.understated * estimate.std, model.scale)
+                moved &= shift > MOVED_STDS * estimate.std_total
+            far = shift > np.maximum(CLEAR_STDS * estimate.understated * estimate.std_total, model.scale)
             if far[moved].any():
                 together = (
                     "the mass matrix is not positive definite, by more than noise explains: the model lacks something"
                 )
         possible &= ~moved
         notes.append("with these values the mass matrix is not positive definite: no machine has them together")
-    doubt = (
+    first = (
         estimate.doubt
         or together
         or _contradiction(model, estimate)
         or "; ".join(dict.fromkeys(d for one in logs for d in one.doubts))
         or _unit_suspicion(model, estimate)
     )
+    doubt = "; ".join(text for text in (first, describe_failures(estimate.tests)) if text)
     if clear and not doubt:
         doubt = f"values that no machine has: check {CAUSES}"
     status = "invalid" if clear else "doubtful" if doubt else "valid"
@@ -118,10 +122,16 @@ def _unit_suspicion(model: Model, estimate: Estimate) -> str:
     comparable = np.isfinite(estimate.value) & (nominal > MIN_NOMINAL_SHARE * largest) & (nominal >= model.scale)
     comparable &= np.abs(model.offsets).sum(axis=0) == 0
     comparable &= ~np.isin(names, [n for e in model.effects for n in e.parameters])
-    clear = comparable & (np.abs(estimate.value - model.nominal) > CLEAR_STDS * estimate.std)
+    clear = comparable & (np.abs(estimate.value - model.nominal) > CLEAR_STDS * estimate.std_total)
     ratio = np.divide(estimate.value, model.nominal, out=np.ones_like(nominal), where=clear)
     turns = any(b.joint == "revolute" for b in model.machine.body)
-    for factor, least, tolerance, question in UNIT_FACTORS if turns else UNIT_FACTORS[:1]:
+    ratios = {abs(float(s.gear_ratio)) for s in model.machine.sensor if s.gear_ratio is not None}
+    squares = [
+        (max(n, 1 / n) ** 2, 2, SQUARE_TOLERANCE, f"that is the square of the gear_ratio {n:g}: is it upside down?")
+        for n in sorted(ratios)
+        if not 1 / LEAST_GEAR < n < LEAST_GEAR
+    ]
+    for factor, least, tolerance, question in (*squares, *(UNIT_FACTORS if turns else UNIT_FACTORS[:1])):
         for one in (factor, 1 / factor):
             off = names[clear & (np.abs(ratio / one - 1) < tolerance)]
             if len(off) >= least:
@@ -151,7 +161,7 @@ def _signs_hold(model: Model, estimate: Estimate) -> tuple[np.ndarray, bool]:
         beyond = -float(wanted.pop()) * estimate.value[k]
         if beyond > 0:
             possible[k] = False
-            clear |= bool(beyond > max(CLEAR_STDS * estimate.understated * estimate.std[k], model.scale[k]))
+            clear |= bool(beyond > max(CLEAR_STDS * estimate.understated * estimate.std_total[k], model.scale[k]))
     return possible, clear
 
 

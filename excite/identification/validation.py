@@ -121,12 +121,25 @@ def compare_torques(model: Model, log: Log, estimate: Estimate, filter: Filter |
     first, *again = (
         _filtered_torques(model, one, estimate, filter) for one in simulate_rereadings(model, log, filter, REREADINGS)
     )
-    return replace(
+    compared = replace(
         plain,
         noise=_local_rms(model, [c.residual - first.residual for c in again]),
         parameters=_parameter_band(model, log, estimate, filter),
         prediction_noise=_local_rms(model, [c.predicted - first.predicted for c in again]),
     )
+    return _with_discrepancy(model, estimate, compared)
+
+
+def _with_discrepancy(model: Model, estimate: Estimate, compared: SignalComparison) -> SignalComparison:
+    """Add what the model lacks, as an error of the prediction, to the noise of a comparison of torques."""
+    lacks = np.zeros((len(model.inputs), 1))
+    for k, body in enumerate(model.machine.actuated):
+        own = [d.rms for d in estimate.discrepancy if d.signal == torque_sensor(model, body.index).name]
+        lacks[k] = np.linalg.norm(own)
+    if not lacks.any():
+        return compared
+    noise, own_noise = (None if x is None else np.hypot(x, lacks) for x in (compared.noise, compared.prediction_noise))
+    return replace(compared, noise=noise, prediction_noise=own_noise)
 
 
 def _settled(log: Log, filter: Filter, rate: float) -> slice:
@@ -161,7 +174,7 @@ def validate_torques(
     space = build_state_space(held, common_sensors(held, [log]))
     try:
         data, start, trajectory = _smooth(space, log, filter)
-        band = _smoothed_parameter_band(space, data, start, trajectory, estimate.covariance, filter)
+        band = _smoothed_parameter_band(space, data, start, trajectory, estimate.total_covariance, filter)
         errors = _smoothing_errors(space, log, data, trajectory, filter) if prediction_noise else None
     except NotConvergedError:
         return compare_torques(model, log, estimate, filter)
@@ -173,14 +186,17 @@ def validate_torques(
     measured = lowpass(data.torque.T, rate, filter)
     noise, own = errors or (np.broadcast_to(gain * data.noise.torque[:, None], error.shape), None)
     units = tuple(_torque_unit(model, k) for k in model.actuated)
-    return SignalComparison(model.inputs, units, log.t, measured, measured + error, noise, band, own)
+    compared = SignalComparison(model.inputs, units, log.t, measured, measured + error, noise, band, own)
+    return _with_discrepancy(model, estimate, compared)
 
 
 def _smooth(space: StateSpace, log: Log, filter: Filter) -> tuple[Measurements, Trajectory, Trajectory]:
     """Smooth the states of a log with all parameters held; return start and result. Raises NotConvergedError."""
     data, X = prepare_measurements(space, log), space.model.nominal
     start = initial_trajectory(space, data, log, filter)
-    fit = fit_logs(space, [data], [start], X, [start], 0.0, np.ones(len(X), bool))
+    fit = fit_logs(space, [data], [start], X, [start], np.ones(len(X), bool))
+    if not fit.linear:
+        fit.required()
     return data, start, fit.trajectories[0]
 
 
@@ -242,7 +258,7 @@ def _parameter_band(model: Model, log: Log, estimate: Estimate, filter: Filter) 
     """Standard deviation (n_u, N) of predicted torques by the parameters' uncertainty."""
     motion = samples(model, log, filter)
     keep = _settled(log, filter, float(model.machine.sampling_hz))
-    root = covariance_root(np.nan_to_num(estimate.covariance))
+    root = covariance_root(np.nan_to_num(estimate.total_covariance))
     band = []
     for row in model.actuated:
         parts = []
@@ -292,7 +308,7 @@ def torque_errors(model: Model, logs: Sequence[Log], estimate: Estimate, filter:
 
 def _torque_unit(model: Model, row: int) -> str:
     turns = model.coordinates[row].startswith("theta")
-    return "A" if model.machine.in_ratios else "N m" if turns else "N"
+    return model.machine.torque_unit or ("N m" if turns else "N")
 
 
 def far_from_nominal(model: Model, estimate: Estimate) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ from .filtered import (
     samples as samples,
     unmeasured as unmeasured,
 )
+from .formats import ENDINGS as ENDINGS, FORMATS as FORMATS, SUFFIXES as SUFFIXES, Format as Format
 from .inspection import Inspection as Inspection, guess_machine as guess_machine, inspect as inspect
 from .log import (
     Log as Log,

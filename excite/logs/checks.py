@@ -21,7 +21,7 @@ from excite.logs.log import Log
 from excite.logs.plausibility import RATES, against, as_speed, is_speed, own_file, rated_speed, step_of, unchanging
 from excite.logs.resampling import BRIDGED_STEPS, held_every
 from excite.logs.times import date_and_time, has_time, seconds
-from excite.model.machine import TURN, Machine, Sensor
+from excite.model.machine import TURN, Machine, Sensor, noise_of
 from excite.text import count, format_number
 
 SHOWN = 3  # places named of what is there many times
@@ -141,7 +141,10 @@ def record_of(table: pd.DataFrame, machine: Machine) -> tuple[Record, dict[str, 
             continue
         rows = np.flatnonzero(there)
         part = table if there.all() else table.iloc[rows].set_axis(range(len(rows)))
-        channels[sensor.name] = Channel(sensor, t[rows], log.values_of(sensor, machine, part, ""), rows)
+        try:
+            channels[sensor.name] = Channel(sensor, t[rows], log.values_of(sensor, machine, part, ""), rows)
+        except LogError as err:
+            unread[sensor.column] = str(err).removeprefix(": ")
     used = {c for s in machine.sensor for c in s.columns}
     own = frozenset(c for c in others if clocks.between_channels(table, c, machine.time_column, used))
     return Record(machine, channels, t, others, own), unread
@@ -360,7 +363,7 @@ def coarse(record: Record) -> Iterator[Finding]:
         passed = given.model_copy(update={"cutoff_hz": given.cutoff_hz.model_copy(update={"value": cutoff})})
         if c.sensor.kind not in ("angle", "wheel") or c.sensor.resolution is not None or too_slow(rate, passed):
             continue
-        step, known = step_of(c.x), max(float(c.sensor.noise or 0.0), float(c.sensor.step or 0.0) / np.sqrt(12))
+        step, known = step_of(c.x), max(noise_of(record.machine, c.sensor), float(c.sensor.step or 0.0) / np.sqrt(12))
         if step / np.sqrt(12) <= ROUNDED_FINE * known or len(c.x) < log.SHORTEST:
             continue
         order = 1 if c.sensor.is_rate else 2

@@ -33,7 +33,7 @@ def on_grid(t: np.ndarray, values: np.ndarray, start: float, step: float, rows: 
     is none, the value is interpolated linearly, and `filled`.
     """
     place = (t - start) / step
-    near = np.rint(place).astype(int)
+    near = np.rint(np.clip(place, -1.0, float(rows))).astype(int)  # rows at times beyond the grid are left out
     off = (place - near) * step
     inside = (near >= 0) & (near < rows)
     exact = bool((np.abs(off[inside]) <= ON_GRID * step).all())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +12,7 @@ import pandas as pd
 
 from excite.errors import LogError as LogError
 from excite.logs import tables
+from excite.logs.cells import as_meant
 from excite.logs.plausibility import rated_speed
 from excite.logs.tables import MDF_TIME, UNCLEAR
 from excite.logs.times import has_time, seconds
@@ -20,6 +22,7 @@ from excite.model.machine import (
     Sensor,
     behind_loop,
     load_machine,
+    noise_of,
     shipped_machines,
     torque_per_pressure,
 )
@@ -27,7 +30,10 @@ from excite.text import count, format_number
 
 SHORTEST = 100  # samples: below this no filter and no estimate makes sense
 OFF_RATE = 0.02  # by which the usual rate of sampling may differ from the machine file's
+SMALLEST, LARGEST = 1e-30, 1e20  # reading in the column's unit: zero below; none beyond; squares of both are floats
+LARGEST_SI = 1e10  # reading [SI] beyond all of a machine's
 GAP = 1.5  # samples from one row to the next that leave something out
+LIVELY_RATIO = 0.8  # of two estimates of noise, below which the one from higher differences counts; chosen
 
 
 @dataclass(frozen=True)
@@ -77,30 +83,28 @@ def read_log(path: str | Path, machine: Machine, needs: Sequence[str] = ()) -> L
 
 def table_of(path: str | Path, machine: Machine) -> pd.DataFrame:
     """The columns of a log as they are; MDF files give the machine's time column its name. Raises LogError."""
-    wanted = [machine.time_column, *(c for s in machine.sensor for c in s.columns)]
+    others = {s.time_column for s in machine.sensor} | {machine.enabled_column}
+    wanted = [machine.time_column, *(c for s in machine.sensor for c in s.columns), *sorted(filter(None, others))]
     table = tables.with_names(tables.read_table(path, wanted), wanted)
     if MDF_TIME in table.columns and machine.time_column not in table.columns:
         one = UNITS[machine.time_unit][1]
         table.insert(0, machine.time_column, table[MDF_TIME] / one)
-    return with_drives_off(table, machine)
-
-
-def with_drives_off(table: pd.DataFrame, machine: Machine) -> pd.DataFrame:
-    """The table with torques of zero where the machine file says that a column is absent while the drive is off."""
-    absent = [s for s in machine.sensor if s.zero_if_absent and not set(s.columns) & set(table.columns)]
-    if not absent:
-        return table
-    attrs = dict(table.attrs)
-    said = [f"no column {', '.join(s.columns)}: {what_of(s, machine)} counts as zero, its drive is off" for s in absent]
-    attrs["notes"] = [*attrs.get("notes", ()), *said]
-    table = table.assign(**{c: 0.0 for s in absent for c in s.columns})
-    table.attrs = attrs
-    return table
+    return as_meant(table, machine, str(path))
 
 
 def white_noise(x: np.ndarray) -> float:
-    """Standard deviation of the white part of a signal, from the median size of its third differences."""
-    return float(np.median(np.abs(np.diff(x, 3)))) / (0.6744897501960817 * np.sqrt(20))
+    """Standard deviation of the white part of a signal, from the median size of its third differences.
+
+    Where a lively motion shows in these, the fifth differences give clearly less and count.
+    """
+    third, fifth = (_noise_of_differences(x, order) for order in (3, 5))
+    return fifth if fifth < LIVELY_RATIO * third else third
+
+
+def _noise_of_differences(x: np.ndarray, order: int) -> float:
+    """Standard deviation of white noise from the median size of its differences of an order."""
+    median = float(np.median(np.abs(np.diff(x, order)))) if len(x) > order else 0.0
+    return median / (0.6744897501960817 * math.sqrt(math.comb(2 * order, order)))
 
 
 def from_table(
@@ -140,7 +144,7 @@ def from_table(
     for s in known:
         if s.loop is not None:
             read = values[s.name][sampled.get(s.name, slice(None))]
-            noise[s.name] = max(white_noise(read), float(s.noise or 0))  # what the drive adds, no command shows
+            noise[s.name] = max(white_noise(read), noise_of(machine, s))  # what the drive adds, no command shows
             values[s.name] = behind_loop(s.loop, values[s.name], float(t[1] - t[0]))
     return Log(source, t, values, sampled=sampled, noise=noise)
 
@@ -169,7 +173,7 @@ def values_of(sensor: Sensor, machine: Machine, table: pd.DataFrame, source: str
     """A sensor's readings (N,) [SI] from its columns: units, torques of pressures. Raises LogError."""
     number = numbers(table, sensor.column, source)
     if sensor.return_column is None:
-        return sensor.gain * number - sensor.shift
+        return _of_a_size(sensor.gain * number, sensor.column, source, LARGEST_SI) - sensor.shift
     back = numbers(table, sensor.return_column, source)
     if not sensor.cylinders:
         return sensor.gain * (number - back)
@@ -204,7 +208,7 @@ def columns_read(sensor: Sensor, machine: Machine) -> tuple[str, ...]:
 def columns_known(machine: Machine) -> frozenset[str]:
     """Columns that a machine file names."""
     own = {c for s in machine.sensor for c in (*s.columns, s.time_column) if c is not None}
-    return frozenset({machine.time_column, *own})
+    return frozenset({machine.time_column, machine.enabled_column or machine.time_column, *own})
 
 
 def cells_of(table: pd.DataFrame, column: str, source: str) -> np.ndarray:
@@ -212,7 +216,7 @@ def cells_of(table: pd.DataFrame, column: str, source: str) -> np.ndarray:
     raw = table[column]
     clear = not table.attrs.get(UNCLEAR, {}).get(column)
     if clear and raw.dtype.kind in "fiub" and not np.isinf(values := raw.to_numpy(dtype=float)).any():
-        return values
+        return _of_a_size(values, column, source)
     blank = raw.isna().to_numpy().copy()
     if raw.dtype.kind in "OTU":
         blank |= (raw.astype(str).str.strip() == "").to_numpy()
@@ -230,7 +234,7 @@ def numbers(table: pd.DataFrame, column: str, source: str, rows: np.ndarray | No
         raise LogError(f"{source}: {unclear}")
     if raw.dtype.kind == "c":
         raise LogError(f"{source}: column {column}: complex numbers, a measurement is real")
-    values = pd.to_numeric(raw, errors="coerce").to_numpy(dtype=float)
+    values = _of_a_size(pd.to_numeric(raw, errors="coerce").to_numpy(dtype=float), column, source, rows=rows)
     bad = ~np.isfinite(values)
     if bad.any():
         k = int(np.argmax(bad))
@@ -241,6 +245,23 @@ def numbers(table: pd.DataFrame, column: str, source: str, rows: np.ndarray | No
         row = k if rows is None else int(rows[k])
         raise LogError(f"{source}: row {row + 1}, column {column}: {what}{more}; cut the log there or repair the value")
     return values
+
+
+def _of_a_size(
+    values: np.ndarray, column: str, source: str, largest: float = LARGEST, rows: np.ndarray | None = None
+) -> np.ndarray:
+    """Return readings (N,), zero where they are next to nothing. Raises LogError for one that no measurement has."""
+    size = np.abs(values)
+    huge = np.isfinite(values) & (size > largest)
+    if huge.any():
+        k = int(np.argmax(huge))
+        row = k if rows is None else int(rows[k])
+        cells, unit = count(int(huge.sum()), "such cell"), " in SI units" if largest == LARGEST_SI else ""
+        raise LogError(
+            f"{source}: row {row + 1}, column {column}: is {values[k]:g}{unit}, which no measurement is; {cells} in"
+            " this column; cut the log there or repair the value"
+        )
+    return np.where(size < SMALLEST, 0.0, values) if (size[size > 0] < SMALLEST).any() else values
 
 
 def fewest_rows(machine: Machine) -> int:

@@ -295,7 +295,8 @@ def is_speed(values: np.ndarray, torques: Sequence[np.ndarray], rate: float) -> 
 def as_speed(units: Sequence[str], machine: Machine) -> str:
     """Advise what to write for a column that holds a speed in one of these units."""
     line = " or ".join(f'unit = "{unit}"' for unit in units)
-    return f"write {line} for it in {own_file(machine)}, with its noise [rad/s] instead of counts_per_turn"
+    noise = 'its noise [rad/s] and noise_unit = "SI"'
+    return f"write {line} for it in {own_file(machine)}, with {noise} instead of counts_per_turn"
 
 
 def _unexplained(torques: np.ndarray, speed: np.ndarray, acceleration: np.ndarray) -> float:

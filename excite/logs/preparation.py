@@ -13,13 +13,14 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs import log, refusal
+from excite.logs.cells import as_meant
 from excite.logs.clocks import is_clock
 from excite.logs.files.common import UNCLEAR, UNITS_SAID, UNITS_UNKNOWN
 from excite.logs.files.layout import known_unit
 from excite.logs.log import Log
 from excite.logs.repair import NEEDED
 from excite.logs.resampling import SAME_RATE, Stretch, at_rate, even_stretches, slower
-from excite.logs.time_axis import Run, order_rows
+from excite.logs.time_axis import Run, evenly, order_rows
 from excite.logs.times import absolute_seconds, has_time, refuse_swapped_dates, seconds
 from excite.model import Model
 from excite.model.machine import TIME_UNITS, UNITS, Machine, Sensor
@@ -111,8 +112,8 @@ def read_stretches(
     source: str | Path | pd.DataFrame, machine: Machine, needs: Sequence[str] = (), rate: float | None = None
 ) -> tuple[list[Stretch], list[str]]:
     """Read one log as even stretches, with notes. Raises LogError."""
-    table = log.with_drives_off(source, machine) if isinstance(source, pd.DataFrame) else log.table_of(source, machine)
     name = _name(source)
+    table = as_meant(source, machine, name) if isinstance(source, pd.DataFrame) else log.table_of(source, machine)
     table = on_one_clock(table, machine, name)
     notes = [f"{name}: {line}" for line in table.attrs.get("notes", ())]
     accepted = refusal.accept(table, machine, needs, name)
@@ -171,7 +172,10 @@ def _ordered(
     """Order rows of a machine's channels with times t (N,) [s] of a clock, as `order_rows` does."""
     turning = [s.column for s in machine.sensor if s.kind in ("angle", "wheel") and not s.is_rate]
     positions = [c for c in turning if c in table.columns]
-    return order_rows(t, table, column, source, positions, 1 / float(machine.sampling_hz), unit)
+    runs, notes = order_rows(t, table, column, source, positions, 1 / float(machine.sampling_hz), unit)
+    if machine.stamps == "arrival":
+        runs = [evenly(run, column, source, notes) for run in runs]
+    return runs, notes
 
 
 def on_one_clock(table: pd.DataFrame, machine: Machine, source: str) -> pd.DataFrame:

@@ -106,7 +106,7 @@ def even_stretches(
     spans = _between(first, last, sorted(itertools.chain.from_iterable(holes)))
     kept = [(a, b) for a, b in spans if b - a >= min(SHORTEST_STRETCH_S, last - first)]
     if not kept:
-        raise LogError(f"{source}: no stretch between gaps lasts {SHORTEST_STRETCH_S:g} s; log without gaps")
+        raise LogError(f"{source}: no stretch between gaps lasts {SHORTEST_STRETCH_S:g} s{_sparse(there)}")
     notes += _notes(run.t, there, own, grid, spans, kept, source, first, last)
     return [_interpolated(part, run, there, machine, a, b, grid) for a, b in kept], notes
 
@@ -132,6 +132,18 @@ def held_every(values: np.ndarray) -> int:
 def ordinal(n: int) -> str:
     """A number as "fifth"."""
     return ORDINALS.get(n, f"{n}th")
+
+
+def _sparse(there: dict[str, np.ndarray]) -> str:
+    """Say what to do about gaps: log without them, or say what blank cells mean."""
+    name, rows = min(there.items(), key=lambda one: one[1].mean())
+    if rows.all():
+        return "; log without gaps"
+    blank = format_number(100 * (1 - float(rows.mean())), 2)
+    return (
+        f": column {name} is blank in {blank} % of the rows; if the logger writes a cell only where its value changes,"
+        ' write blank_means = "unchanged" in the machine file'
+    )
 
 
 def _readings(column: pd.Series, name: str, source: str) -> np.ndarray:

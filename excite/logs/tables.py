@@ -8,9 +8,11 @@ from pathlib import Path
 import pandas as pd
 
 from excite.errors import LogError
-from excite.logs.files import BAG_FOLDER, READERS
+from excite.logs.files import reader_of
+from excite.logs.files.canbus import is_candump
 from excite.logs.files.common import NOTES, OTHER_NAMES, TIMESTAMPS, UNCLEAR as UNCLEAR, UNITS_SAID, UNITS_UNKNOWN
 from excite.logs.files.text import COMMENTS as COMMENTS
+from excite.logs.formats import BAG_FOLDER, ENDINGS
 
 MDF_TIME = TIMESTAMPS
 
@@ -29,9 +31,10 @@ def read_table(path: str | Path, wanted: Iterable[str] = ()) -> pd.DataFrame:
         raise LogError(f"{path}: no such file" if not path.is_dir() else f"{path}: is a folder, give a file")
     if not folder and path.stat().st_size == 0:
         raise LogError(f"{path}: the file is empty")
-    reader = READERS[".db3"] if folder or path.name == BAG_FOLDER else READERS.get(path.suffix.lower())
+    suffix = ".db3" if folder or path.name == BAG_FOLDER else path.suffix.lower()
+    reader = reader_of(".log" if suffix == ".txt" and is_candump(path) else suffix)
     if reader is None:
-        raise LogError(f"{path}: unknown kind of file {path.suffix!r}, allowed: {', '.join(READERS)}")
+        raise LogError(f"{path}: unknown kind of file {path.suffix!r}, allowed: {ENDINGS}")
     table = reader(path, frozenset(wanted))
     if table.empty:
         raise LogError(f"{path}: no rows of data")

@@ -146,6 +146,29 @@ def _even_ticks(run: Run, column: str, nominal_step: float, source: str, notes: 
     return Run(run.rows, float(np.mean(t - slope * k)) + slope * k)
 
 
+def evenly(run: Run, column: str, source: str, notes: list[str]) -> Run:
+    """A run whose rows were sampled evenly and stamped when they arrived: even times along the stamps.
+
+    Raises LogError where the stamps leave an even clock, as rows are lost or the rate changes.
+    """
+    if len(run.t) < MIN_RUN_ROWS:
+        return run
+    k = np.arange(len(run.t))
+    slope, start = np.polyfit(k, run.t, 1)
+    late = np.abs(run.t - (start + slope * k))
+    if slope <= 0 or late.max() > GAP_STEPS * slope:
+        raise LogError(
+            f"{source}: row {run.rows[int(np.argmax(late))] + 1}, column {column}: stamps of arrival leave an even"
+            f" clock by {format_number(float(late.max()), 3)} s: rows are lost, or the rate changes; take stamps out of"
+            " the machine file"
+        )
+    notes.append(
+        f"{source}: stamps of arrival, up to {format_number(1e3 * float(late.max()), 3)} ms off: rows are taken to be"
+        f" {format_number(1e3 * slope, 4)} ms apart"
+    )
+    return Run(run.rows, start + slope * k)
+
+
 def _ticks_allow(t: np.ndarray, begin: np.ndarray, tick: float, step: float) -> bool:
     """Tell if rows `step` [s] apart explain times t (N,) [s] in ticks, which begin in rows (M,) within a step each."""
     off = t - step * np.arange(len(t))

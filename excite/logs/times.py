@@ -36,6 +36,7 @@ CLOCK = re.compile(r"\s*([+-]?)(?:(\d+)\s+days?,?\s*)?\+?(\d+):(\d{1,2})(?::(\d{
 DAY_MONTH = re.compile(r"(\d{1,2})([-./])(\d{1,2})[-./]\d{2,4}(?!\d)")  # 22/11/2026
 MONTHS = 12
 DAYS_PER_MONTH = 30.4  # [day]
+LATEST_S = 1e20  # [s] of a clock, whatever its unit: nanoseconds since 1970 are 2e18
 FIRST_YEAR, LAST_YEAR = 1678, 2261  # whose nanoseconds fit 64 bits
 
 
@@ -56,7 +57,7 @@ def seconds(table: pd.DataFrame, machine: Machine, source: str) -> np.ndarray:
     else:
         raw = table[name]
     found = _parse(raw, UNITS[machine.time_unit][1])
-    bad = ~np.isfinite(found)
+    bad = ~(np.abs(found) < LATEST_S)
     if bad.any():
         k = int(np.argmax(bad))
         cell = raw.iloc[k]

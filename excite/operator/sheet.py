@@ -15,7 +15,7 @@ from matplotlib.patches import Polygon
 
 from excite import reports
 from excite.model import Model
-from excite.model.machine import Machine, Sensor
+from excite.model.machine import Machine, Sensor, noise_of, si_per_number
 from excite.operator import ground
 from excite.operator.ground import DriveQuality, TouchedGround, Trace
 from excite.reports import COLOURS
@@ -78,11 +78,7 @@ def _first(sheet: Sheet) -> Figure:
     figure = Figure(figsize=A4)
     _head(figure, sheet, 1)
     rows = drive_facts(sheet)
-    widths = np.array([max(len(value) * 1.35, len(name)) + 3 for name, value in rows], float)
-    starts = LEFT + (RIGHT - LEFT) * np.concatenate([[0.0], np.cumsum(widths)[:-1]]) / widths.sum()
-    for x, (name, value) in zip(starts, rows, strict=True):
-        figure.text(x, 0.908, value, fontsize=9, weight="bold")
-        figure.text(x, 0.895, name, fontsize=7, color="0.25")
+    _facts(figure, rows)
     lane = figure.add_axes((LEFT, 0.57, RIGHT - LEFT, 0.3))
     _lane(lane, sheet)
     trace = sheet.trace
@@ -101,6 +97,22 @@ def _first(sheet: Sheet) -> Figure:
         bottom.yaxis.set_major_formatter(lambda degrees, _: f"{abs(degrees):g}")  # the side is said in words
     bottom.set_xlabel("time [s]; the grey band is the tolerance", fontsize=8)
     return figure
+
+
+def _facts(figure: Figure, rows: Sequence[tuple[str, str]]) -> None:
+    """Write facts side by side: values above their names, smaller if the page is too narrow for them."""
+    texts = [
+        (figure.text(LEFT, 0.908, value, fontsize=9, weight="bold"), figure.text(LEFT, 0.895, name, fontsize=7))
+        for name, value in rows
+    ]
+    widths = np.array([max(text.get_window_extent().width for text in both) for both in texts]) / figure.bbox.width
+    smaller = min(1.0, (RIGHT - LEFT - GAP * (len(rows) - 1)) / widths.sum())
+    between = (RIGHT - LEFT - smaller * widths.sum()) / max(len(rows) - 1, 1)
+    starts = LEFT + np.concatenate([[0.0], np.cumsum(smaller * widths + between)[:-1]])
+    for x, both in zip(starts, texts, strict=True):
+        for text in both:
+            text.set_x(x)
+            text.set_fontsize(smaller * text.get_fontsize())
 
 
 def _head(figure: Figure, sheet: Sheet, page: int) -> None:
@@ -385,11 +397,8 @@ def set_up_lines(machine: Machine) -> list[str]:
 
 
 def _noise_words(machine: Machine, sensor: Sensor) -> str:
-    """Return the noise of a sensor in the unit of its column, in SI where cylinders make the torque."""
-    noise = float(sensor.noise or 0)
-    if sensor.cylinders or not sensor.gain:
-        return f"{format_number(noise, 3)} {machine.si_unit(sensor)}"
-    return f"{format_number(noise / abs(sensor.gain), 3)} {sensor.unit}"
+    """Return the noise of a sensor in the unit of its column."""
+    return f"{format_number(noise_of(machine, sensor) / si_per_number(machine, sensor), 3)} {sensor.unit}"
 
 
 def sensor_line(machine: Machine, sensor: Sensor) -> str:

@@ -7,6 +7,14 @@ from .description import (
     format_sum as format_sum,
 )
 from .descriptions import describe as describe, with_sentences as with_sentences
+from .design_figures import (
+    campaign_figure as campaign_figure,
+    compare_figure as compare_figure,
+    design_figure as design_figure,
+    draw_campaign as draw_campaign,
+    sensors_figure as sensors_figure,
+    sigma_figure as sigma_figure,
+)
 from .diagnosis_figures import (
     figure_calls as figure_calls,
     figures_by_file as figures_by_file,
@@ -21,20 +29,21 @@ from .figure_files import (
 )
 from .figures import (
     COLOURS as COLOURS,
-    campaign_figure as campaign_figure,
-    compare_figure as compare_figure,
+    budget_figure as budget_figure,
     comparison_figure as comparison_figure,
     correlation_figure as correlation_figure,
-    design_figure as design_figure,
-    draw_campaign as draw_campaign,
     escape_dollar as escape_dollar,
+    is_narrow as is_narrow,
+    legend_above as legend_above,
+    legend_below as legend_below,
+    new_figure as new_figure,
     prediction_figure as prediction_figure,
     prior_figure as prior_figure,
     save as save,
-    sensors_figure as sensors_figure,
-    sigma_figure as sigma_figure,
+    set_title as set_title,
     verify_figure as verify_figure,
 )
+from .handover_descriptions import rehearsal_words as rehearsal_words
 from .html import (
     Picture as Picture,
     report_page as report_page,

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 from excite.reports.description import Description, Summary, Table, format_sum
 from excite.text import count, format_number
 
@@ -58,7 +61,26 @@ def describe_machine(s: Summary) -> Description:
         " some random drives leaves."
     )
     tables = (Table(caption, MACHINE_COLUMNS, rows, optional=(1, 2)),) if rows else ()
+    tables = (*tables, *_sensor_table(s.get("sensors", ())))
     return Description(f"The machine file {s['file']}", headline, tables, _check_remarks(s))
+
+
+def _sensor_table(sensors: Sequence[Mapping[str, Any]]) -> tuple[Table, ...]:
+    """Return the table of a machine's sensors, none without sensors."""
+    rows = tuple(
+        (
+            " - ".join(r["columns"]),
+            r["unit"],
+            format_number(r["rate_hz"], 4),
+            *(format_number(r[key], 3) for key in ("noise", "noise_si")),
+            r["si_unit"],
+            *(format_number(r[key], 3) for key in ("resolution", "at_limit")),
+        )
+        for r in sensors
+    )
+    caption = "Sensors: noise, resolution and reading at the limit in the unit of the column; noise also in SI."
+    names = ("column", "unit", "rate [Hz]", "noise", "noise in SI", "SI unit", "resolution", "at the limit")
+    return (Table(caption, names, rows),) if rows else ()
 
 
 def _count_things(n: int) -> str:

@@ -16,6 +16,7 @@ from excite.reports.design_descriptions import (
 )
 from excite.reports.diagnosis_descriptions import describe_diagnose, describe_study
 from excite.reports.estimate_descriptions import describe_identify, describe_predict, describe_slip, describe_verify
+from excite.reports.handover_descriptions import describe_handover
 
 
 def describe(kind: str, summary: Summary) -> Description:
@@ -33,6 +34,7 @@ DESCRIPTIONS: dict[str, Callable[[Summary], Description]] = {
     "design": describe_design,
     "campaign": describe_campaign,
     "drive": describe_drive,
+    "handover": describe_handover,
     "score": describe_score,
     "compare": describe_compare,
     "verify": describe_verify,

@@ -42,6 +42,7 @@ def describe_design(s: Summary) -> Description:
         f" (one standard deviation, Cramer-Rao bound; worst {worst}, median"
         f" {format_percent(np.median(list(sigma.values())))}); {limits}."
     )
+    headline = _unseen_collisions(s) + headline
     remarks = [
         f"Condition number of Phi {format_number(s['cond_phi'], 4)}, of W {format_number(s['cond_w'], 4)}; best start"
         f" {format_number(s['cond_phi_start'], 4)}."
@@ -51,7 +52,13 @@ def describe_design(s: Summary) -> Description:
         remarks.append(
             f"The lowest cond(Phi) found is {format_number(lowest['cond_phi'], 4)}, with {lowest['worst_parameter']}"
             f" to {format_percent(lowest['worst_percent'])}; this drive is the most accurate one within"
-            f" {s['cond_slack_percent']:g} % of it (`--cond-slack 0` gives the other)."
+            f" {format_percent(s['cond_slack_percent'], 3)} of it (`--cond-slack 0` gives the other)."
+        )
+    other = s.get("most_accurate")
+    if other:
+        remarks.append(
+            f"The other end, `--objective accuracy`: {other['worst_parameter']} to"
+            f" {format_percent(other['worst_percent'])} or better at cond(Phi) {format_number(other['cond_phi'], 4)}."
         )
     if s.get("bound"):
         b = s["bound"]
@@ -74,7 +81,7 @@ def describe_design(s: Summary) -> Description:
         remarks.append("Cut short: this is the best drive so far, more time may find a better one.")
     if s.get("advice"):
         remarks.append(s["advice"])
-    tables = [_sigma_table(s)]
+    tables = [*_ends_table(s), _sigma_table(s)]
     if s.get("driver"):
         by_hand_remarks, by_hand_tables = _describe_by_hand(s)
         remarks = [*by_hand_remarks, *remarks]
@@ -89,6 +96,7 @@ def describe_design(s: Summary) -> Description:
             "The arm follows the joint positions in profile.csv; the torques there are what the motion takes."
             + _describe_kept_limits(s)
         )
+        remarks += _describe_clearance(s)
     else:
         remarks.append(
             "A person at the levers drives something else: `excite drive` makes phases of this drive and says what they"
@@ -99,6 +107,54 @@ def describe_design(s: Summary) -> Description:
     return Description(
         f"Test drive for {s['machine']}, problem {s['problem']}", headline, tuple(tables), tuple(remarks)
     )
+
+
+def _ends_table(s: Summary) -> list[Table]:
+    """Table of the drives between lowest cond(Phi) and highest accuracy, to choose from; none without others."""
+    ends = {"lowest cond(Phi), --cond-slack 0": s.get("lowest_cond"), "this drive": s}
+    ends["for accuracy, --objective accuracy"] = s.get("most_accurate")
+    rows = tuple(
+        (
+            name,
+            format_number(end["cond_phi"], 4),
+            end["worst_parameter"],
+            format_number(end["worst_percent"], 3),
+            format_number(end["median_percent"], 3),
+        )
+        for name, end in ends.items()
+        if end
+    )
+    if len(rows) < 2:
+        return []
+    caption = "Drives to choose from: a low cond(Phi), or small errors; standard deviations in per cent."
+    return [Table(caption, ("drive", "cond(Phi)", "worst parameter", "worst [%]", "median [%]"), rows)]
+
+
+def _unseen_collisions(s: Summary) -> str:
+    """Say in the first words that collisions were not looked at, "" where they were or for other machines."""
+    seen = s.get("collisions")
+    if seen is None or seen["looked_at"]:
+        return ""
+    floor = seen["floor_m"]
+    kept = "" if floor is None else f", only joints and tool are kept above z = {floor:g} m"
+    return f"Collisions were not looked at: the machine file has no shapes{kept}. "
+
+
+def _describe_clearance(s: Summary) -> list[str]:
+    """Say where a joint motion starts, what keeps its distance, and which pairs do not count."""
+    if "start" not in s:
+        return []
+    place = ", ".join(
+        f"{c} {math.degrees(x):.1f} deg" if c.startswith("theta") else f"{c} {x:.3f} m" for c, x in s["start"].items()
+    )
+    said = [f"It starts at {place}; `excite handover` writes it for a controller and says what will move where."]
+    seen = s["collisions"]
+    if seen["looked_at"]:
+        below = "" if seen["floor_m"] is None else f", and from the floor at z = {seen['floor_m']:g} m"
+        pairs = join_some([" and ".join(pair) for pair in seen["left_out"]])
+        out = f"; pairs that touch in nearly every pose do not count: {pairs}" if seen["left_out"] else ""
+        said.append(f"Shapes stay {1000 * seen['margin_m']:g} mm apart{below}{out}.")
+    return said
 
 
 def describe_campaign(s: Summary) -> Description:

@@ -20,7 +20,18 @@ from excite import diagnosis
 from excite.diagnosis import Diagnosis, LogResiduals, TorqueDiagnosis
 from excite.model import signal_descriptions
 from excite.reports.charts import EXPLORE, Explorable
-from excite.reports.figures import COLOURS, escape_dollar, save, set_title, wrap_label
+from excite.reports.figure_files import layout_width, wrap_title
+from excite.reports.figures import (
+    COLOURS,
+    TITLE_SIZE,
+    is_narrow,
+    legend_below,
+    legend_columns,
+    new_figure,
+    save,
+    set_title,
+    wrap_label,
+)
 from excite.reports.torque_figures import torque_figures_by_file
 from excite.text import format_number
 
@@ -29,9 +40,13 @@ MAX_ROWS = 3  # torques and forces in a figure; chosen
 MAX_COLUMNS = 4  # panels side by side; chosen
 # Sizes are given in inches: measuring all labels would take as long as drawing them.
 PANEL = 2.9, 1.8  # width and height with labels
-INSET = 0.52, 0.4, 0.08, 0.14  # room for labels: left, below, right, above
+MIN_PANEL_IN = 2.2  # width of a panel; chosen
+TITLE_LINE_IN = 0.2  # of a title or legend
+INSET = 0.62, 0.42, 0.1, 0.14  # room for labels: left, below, right, above
 HEAD = 0.28  # above the panels of one torque or force
 EDGE = 0.35  # for the title, and for the legend
+SIGNAL_LETTERS, SIGNAL_LETTERS_NARROW = 40, 26  # of a signal's name in a line; chosen
+MAP_IN = 2.0  # height of a map below a course over time; chosen
 MISSING_LETTERS = 36  # of the label of a missing torque in a line; chosen
 MAP_INTERVALS = 3  # between ticks of speed, at most; chosen
 PLAIN_POWERS = -3, 5  # powers of ten that axes write without an exponent; chosen
@@ -107,10 +122,11 @@ def clearest_figure(before: LogResiduals, after: LogResiduals | None, title: str
     evidence = _evidence(before)
     pairs = sorted(((row, q) for row in evidence for q in evidence[row]), key=lambda p: -evidence[p[0]][p[1]])
     clear = [p for p in pairs if evidence[p[0]][p[1]] > CLEAR_STRENGTH][:MAX_CLEAR] or pairs[:MIN_CLEAR]
-    columns = min(len(clear), 2)
-    figure = Figure(figsize=(5.2 * columns, 3.3 * -(-len(clear) // columns) + 0.8), layout="constrained")
+    columns = 1 if is_narrow(5.2 * min(len(clear), 2)) else min(len(clear), 2)
+    lines = -(-len(clear) // columns)
+    figure = new_figure(5.2 * columns, (2.6 if is_narrow(5.2 * columns) else 3.3) * lines + 0.8)
     set_title(figure, title)
-    axes = figure.subplots(-(-len(clear) // columns), columns, squeeze=False).ravel()
+    axes = figure.subplots(lines, columns, squeeze=False).ravel()
     for ax, (row, quantity) in zip(axes, clear, strict=False):
         _against(ax, before, after, row, quantity)
         ax.set_gid(EXPLORE)
@@ -119,33 +135,42 @@ def clearest_figure(before: LogResiduals, after: LogResiduals | None, title: str
         ax.tick_params(which="both", labelsize=8)
     for ax in axes[len(clear) :]:
         ax.set_axis_off()
-    figure.legend(*_key(before, after, [row for row, _ in clear]), loc="outside lower center", ncols=3)
+    legend_below(figure, *_key(before, after, [row for row, _ in clear]))
     return figure
 
 
 def misfit_figure(before: LogResiduals, after: LogResiduals | None, title: str) -> Figure:
     """Plot the largest missing torques and forces against the state of the machine, and their spectra.
 
-    A thick frame marks the quantity on which a torque depends most clearly.
+    A thick frame marks the quantity on which a torque depends most clearly. A narrow figure shows one torque.
     """
     evidence = _evidence(before)
     rows = sorted(evidence, key=lambda row: -max(evidence[row].values()))[:MAX_ROWS]
+    width = layout_width(MAX_COLUMNS * PANEL[0])
+    rows = rows[:1] if is_narrow(MAX_COLUMNS * PANEL[0]) else rows
+    columns = max(1, min(MAX_COLUMNS, int(width / MIN_PANEL_IN)))
+    panel = width / columns, PANEL[1]
     panels = max(sum(row in v for _, v in before.quantities.values()) for row in rows) + 1
-    block = HEAD + -(-panels // MAX_COLUMNS) * PANEL[1]
-    width, height = MAX_COLUMNS * PANEL[0], len(rows) * block + 2 * EDGE
-    figure = Figure(figsize=(width, height))
-    figure.suptitle(escape_dollar(title), fontsize=11, y=1 - EDGE / 2 / height, va="center")
+    block = HEAD + -(-panels // columns) * panel[1]
+    figure = Figure(figsize=(width, 1.0))
+    head = EDGE + TITLE_LINE_IN * wrap_title(figure, title, TITLE_SIZE).count("\n")
+    key = _key(before, after, rows)
+    side_by_side = legend_columns(key[1], width)
+    foot = EDGE + TITLE_LINE_IN * (-(-len(key[1]) // side_by_side) - 1)
+    height = len(rows) * block + head + foot
+    figure.set_figheight(height)
+    set_title(figure, title, y=1 - head / 2 / height, va="center")
     left, below, right, above = INSET
-    share = (PANEL[0] - left - right) / width, (PANEL[1] - below - above) / height
+    share = (panel[0] - left - right) / width, (panel[1] - below - above) / height
     for k, row in enumerate(rows):
-        top = height - EDGE - k * block - HEAD
+        top = height - head - k * block - HEAD
         words = f"missing {row} [{before.missing[row][1]}]"
-        figure.text(0.01, (top + HEAD / 2) / height, words, fontsize=9.5, va="center")
+        figure.text(0.01, (top + HEAD / 2) / height, wrap_title(figure, words, 9.5), fontsize=9.5, va="center")
         own = [q for q, (_, values) in before.quantities.items() if row in values]
         clearest = max(own, key=lambda q: evidence[row][q])
         for n, name in enumerate([*own, None]):
-            down, across = divmod(n, MAX_COLUMNS)
-            x, y = across * PANEL[0] + left, top - (down + 1) * PANEL[1] + below
+            down, across = divmod(n, columns)
+            x, y = across * panel[0] + left, top - (down + 1) * panel[1] + below
             ax = figure.add_axes((x / width, y / height, *share))
             if name is None:
                 _spectrum(ax, before, after, row)
@@ -154,8 +179,8 @@ def misfit_figure(before: LogResiduals, after: LogResiduals | None, title: str) 
             if name == clearest and evidence[row][name] > CLEAR_STRENGTH:
                 for spine in ax.spines.values():
                     spine.set_linewidth(2.2)
-            ax.tick_params(which="both", labelsize=7)
-    figure.legend(*_key(before, after, rows), loc="lower center", ncols=3, fontsize=9, frameon=False)
+            ax.tick_params(which="both", labelsize=8)
+    figure.legend(*key, loc="lower center", ncols=side_by_side, fontsize=8, frameon=False)
     return figure
 
 
@@ -190,10 +215,10 @@ def _against(ax: Axes, before: LogResiduals, after: LogResiduals | None, row: st
         if at is not None:
             centre, mean, _ = diagnosis.bin_means(at, after.missing[row][0], 0.0)
             ax.plot(centre, mean, color=AFTER, linewidth=1.4, linestyle="--", label="with the findings")
-    ax.locator_params("x", nbins=6, steps=(1, 2, 5, 10))
+    ax.locator_params("x", nbins=MAP_INTERVALS, steps=(1, 2, 5, 10))
     ax.ticklabel_format(scilimits=PLAIN_POWERS, useOffset=False)
     for axis in (ax.xaxis, ax.yaxis):
-        axis.get_offset_text().set_fontsize(7)
+        axis.get_offset_text().set_fontsize(8)
     ax.set_xlabel(f"{column.replace('_', ' ')} [{before.quantities[column][0]}]", fontsize=8, labelpad=1)
     ax.grid(alpha=0.3)
 
@@ -215,10 +240,18 @@ def when_figure(
     shown = [(before, "without what was found" if after is not None else "")]
     if after is not None:
         shown.append((after, "with it"))
-    m = len(before.sensors)
-    figure = Figure(figsize=(12, (0.34 * m + 1.7) * len(shown) + 0.6), layout="constrained")
+    m, narrow = len(before.sensors), is_narrow(12)
+    letters = SIGNAL_LETTERS_NARROW if narrow else SIGNAL_LETTERS
+    signals = [wrap_label((words or {}).get(n, n), letters) for n in before.sensors]
+    block = max(m * (0.1 + 0.16 * max(1 + one.count("\n") for one in signals)), 1.6) + 0.6
+    if narrow:
+        figure = new_figure(12, (block + MAP_IN) * len(shown) + 0.8)
+        every: Any = figure.subplots(2 * len(shown), 1, height_ratios=(block, MAP_IN) * len(shown))
+        axes = every.reshape(len(shown), 2)
+    else:
+        figure = new_figure(12, block * len(shown) + 0.6)
+        axes = figure.subplots(len(shown), 2, squeeze=False, width_ratios=(2.2, 1), sharex="col")
     set_title(figure, title)
-    axes = figure.subplots(len(shown), 2, squeeze=False, width_ratios=(2.2, 1), sharex="col")
     norm = LogNorm(1 / 3, MAX_INNOVATION)
     picture = None
     for k, (course, kind) in enumerate(shown):
@@ -228,15 +261,20 @@ def when_figure(
         picture = ax.pcolormesh(
             np.append(t - step, t[-1] + step), np.arange(m + 1), size, norm=norm, cmap="inferno_r", rasterized=True
         )
-        ax.set_yticks(np.arange(m) + 0.5, [(words or {}).get(n, n) for n in course.sensors], fontsize=9)
+        ax.set_yticks(np.arange(m) + 0.5, signals, fontsize=8)
         ax.invert_yaxis()
-        ax.set_title(f"when, in which signal {f'({kind})' if kind else ''}", fontsize=9, loc="left")
+        heading = f"when, in which signal {f'({kind})' if kind else ''}"
+        ax.set_title(wrap_label(heading, 30 if narrow else 60), fontsize=9, loc="left")
         _map(axes[k, 1], course, norm)
-    axes[-1, 0].set_xlabel("time [s]")
+        for each in axes[k]:
+            each.tick_params(labelsize=8)
+    axes[-1, 0].set_xlabel("time [s]", fontsize=9)
     assert picture is not None
-    bar = figure.colorbar(picture, ax=axes[:, 1], ticks=[0.5, 1, 2, 5, 10, 20])
-    bar.ax.set_yticklabels(["0.5", "1: noise", "2", "5", "10", "20"])
-    bar.set_label("mean square error of one step ahead,\nin units of noise", fontsize=9)
+    ticks = {0.5: "0.5", 1: "1 = noise", 2: "2", 5: "5", 10: "10", 20: "20"}
+    where: dict[str, Any] = {"location": "bottom", "aspect": 30, "pad": 0.01} if narrow else {"location": "right"}
+    bar = figure.colorbar(picture, ax=axes.ravel() if narrow else axes[:, 1], **where)
+    bar.set_ticks(list(ticks), labels=list(ticks.values()), fontsize=8)
+    bar.set_label(wrap_label("mean square error one step ahead, over that of noise alone [-]", 30), fontsize=9)
     return figure
 
 
@@ -257,7 +295,7 @@ def _map(ax: Axes, course: LogResiduals, norm: LogNorm) -> None:
     ax.pcolormesh(*bins, mean.T, norm=norm, cmap="inferno_r", rasterized=True)
     ax.set_title("where, over all signals", fontsize=9, loc="left")
     ax.locator_params("x", nbins=MAP_INTERVALS)
-    ax.set_xlabel(f"speed [{x_unit}]")
+    ax.set_xlabel(f"speed [{x_unit}]", fontsize=9)
     ax.set_ylabel(f"{up.replace('_', ' ')} [{y_unit}]", fontsize=9)
 
 
@@ -278,10 +316,13 @@ def signals_figure(
 
     found: whether there are findings; without them only the errors before are plotted. words: what signals are called.
     """
-    names = list(signals)
-    figure = Figure(figsize=(11, 0.5 * len(names) + 1.9), layout="constrained")
+    names, narrow = list(signals), is_narrow(11)
+    letters = SIGNAL_LETTERS_NARROW if narrow else SIGNAL_LETTERS
+    called = [wrap_label((words or {}).get(n, n), letters) for n in names]
+    block = 0.2 * len(names) + 0.2 * sum(1 + one.count("\n") for one in called)
+    figure = new_figure(11, 2 * block + 2.8 if narrow else block + 1.9)
     set_title(figure, title)
-    left, right = figure.subplots(1, 2, sharey=True)
+    left, right = figure.subplots(2, 1) if narrow else figure.subplots(1, 2, sharey=True)
     places = np.arange(len(names))[::-1].astype(float)
     kinds = (("before", BEFORE, 0.2, ""), ("after", AFTER, -0.2, "//")) if found else (("before", BEFORE, 0.0, ""),)
     for kind, colour, shift, hatch in kinds:
@@ -304,11 +345,12 @@ def signals_figure(
                     fontsize=8,
                     bbox={"boxstyle": "square,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.8},
                 )
-    left.set_yticks(places, [escape_dollar((words or {}).get(n, n)) for n in names], fontsize=9)
+    for ax in (left, right) if narrow else (left,):
+        ax.set_yticks(places, called, fontsize=8)
     left.set_xlim(0, 100)
     left.set_xticks((0, 25, 50, 75, 100))
-    left.set_xlabel("systematic share of the error one step ahead [%]")
-    right.set_xlabel("error on withheld stretches [% of that without]")
+    left.set_xlabel("systematic share of the error one step ahead [%]", fontsize=8 if narrow else 9)
+    right.set_xlabel("error on withheld stretches [% of that without]", fontsize=8 if narrow else 9)
     if not any(np.isfinite(row["rms_before"] or np.nan) for row in signals.values()):
         right.set_axis_off()
         none = (
@@ -319,5 +361,5 @@ def signals_figure(
         ax.grid(axis="x", alpha=0.3)
         ax.set_axisbelow(True)
     if found:
-        figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=9, frameon=False)
+        legend_below(figure, *left.get_legend_handles_labels())
     return figure

@@ -21,11 +21,12 @@ from excite.reports.description import (
     meaning_index,
 )
 from excite.smoothing import MAX_IDENTIFIABLE_STD
-from excite.text import count, format_number, format_percent, format_rounded, format_uncertain
+from excite.text import count, format_number, format_p_value, format_percent, format_rounded, format_uncertain
 
 MISFIT_OF_REPEATS = 2.0  # error over repeatability, from which something remains; chosen
 FALSE_ALARM = 0.01  # probability of a verdict against intervals that hold; chosen
 MOVED_LEVEL = 1e-3  # p-value below which more than a payload changed between two estimates; chosen
+DISAGREE = 0.01  # p-value below which known values are said to disagree
 
 
 def describe_verify(s: Summary) -> Description:
@@ -94,6 +95,7 @@ ESTIMATE_COLUMNS = (  # of a parameter: heading, key
     ("value", "value"),
     ("std", "std"),
     ("std %", "std_percent"),
+    ("std total", "std_total"),
     ("95 % from", "low95"),
     ("to", "high95"),
 )
@@ -101,7 +103,7 @@ ESTIMATE_COLUMNS = (  # of a parameter: heading, key
 
 def _estimate_cell(row: Mapping[str, Any], key: str) -> str:
     """Format a number of a parameter: one in its unit to the decimals of its standard deviation, or in per cent."""
-    return format_number(row[key], 2) if key.endswith("percent") else format_rounded(row[key], row["std"])
+    return format_number(row.get(key), 2) if key.endswith("percent") else format_rounded(row.get(key), row["std"])
 
 
 def describe_identify(s: Summary) -> Description:
@@ -114,20 +116,18 @@ def describe_identify(s: Summary) -> Description:
     what = count(every, "parameter is", "parameters are")
     what = f"{len(known)} of {what}" if s["unidentifiable"] else what
     logs = "one log" if len(s["logs"]) == 1 else f"{len(s['logs'])} logs"
-    share = s["relative_error_percent"]
-    known_error = share is not None and np.isfinite(share)
-    error = f"{format_percent(share)} of what was measured" if known_error else "unknown, as no torque was measured"
+    error = _prediction_error(s)
     accuracy = (
         f" {format_percent(float(np.median(list(known.values()))))} (median, one standard deviation; worst {worst},"
         f" {format_percent(known[worst])})"
         if known
         else " no known accuracy"
     )
-    headline = f"From {logs}, {what} identified to{accuracy}; the prediction error is {error}."
+    headline = f"From {logs}, {what} identified to{accuracy}; {error}."
     if s["status"] == "doubtful":
         headline = (
             f"From {logs}, {what} estimated, but their 95 % intervals do not hold: {s['doubt']} (stated:{accuracy};"
-            f" prediction error {error})."
+            f" {error})."
         )
     off = {n: abs(r["bias"] / (r["value"] - r["bias"])) for n, r in rows.items() if n in known and _is_biased(r)}
     impossible = [n for n, r in rows.items() if not r["possible"]]
@@ -136,7 +136,7 @@ def describe_identify(s: Summary) -> Description:
         headline = f"{headline[:-1]}; {join_some(impossible)} {have} that no machine has."
     if s["status"] == "invalid":
         reason = f", and {join_some(impossible)} would have values that no machine has" if impossible else ""
-        headline = f"No estimate from {logs} (prediction error {error}){reason}: {s['doubt']}."
+        headline = f"No estimate from {logs} ({error}){reason}: {s['doubt']}."
     wrong: tuple[str, ...] = ()
     if off and s["status"] != "invalid":
         most = max(off, key=lambda n: off[n])
@@ -185,11 +185,94 @@ def describe_identify(s: Summary) -> Description:
     by_joint = s.get("error_by_joint", {})
     tables = (
         Table(caption, names, table, marked, meaning_index(s), grey=s["status"] != "valid"),
-        *((_joint_errors_table(by_joint),) if len(by_joint) > 1 else ()),
+        *((_fit_table(s["fit"]),) if s.get("fit") else ()),
+        *((_budget_table(s),) if any(len(x) > 1 for x in s.get("budget", {}).values()) else ()),
+        *((_joint_errors_table(by_joint),) if len(by_joint) > 1 and not s.get("fit") else ()),
         *((_payload_table(s["payload"]),) if "payload" in s else ()),
     )
     verdict = _judge_estimate(s, max(known.values(), default=None), impossible)
+    if "torque_constant" in s and s["status"] != "invalid":
+        remarks = [_describe_constant(s["torque_constant"]), *remarks]
     return Description(f"Parameters of {s['machine']}", headline, tables, tuple(remarks), s["status"], verdict)
+
+
+def _describe_constant(c: Mapping[str, Any]) -> str:
+    """Say what the torque constant is, from which known quantities, and whether these agree."""
+    apart = c["p_value"] is not None and c["p_value"] < DISAGREE
+    return (
+        f"Torque constant of the motors: {format_uncertain(c['value'], c['std'], c['unit'])} (95 %:"
+        f" {format_number(c['low95'], 4)} to {format_number(c['high95'], 4)}), from {', '.join(c['known'])}; multiply a"
+        " value by it to get it in SI units."
+    ) + (f" The known values disagree on it (p-value {format_p_value(c['p_value'])})." if apart else "")
+
+
+def _prediction_error(s: Summary) -> str:
+    """Say how far torques that are predicted from the measured motion are off those that were measured."""
+    fit = [r for r in s.get("fit", {}).values() if r["measured_rms"]]
+    if fit:
+        worst = max(fit, key=lambda r: r["rms"] / r["measured_rms"])
+        text = (
+            "torques predicted from the measured motion are off by"
+            f" {format_percent(100 * worst['rms'] / worst['measured_rms'])} of their rms at most"
+        )
+        if worst["expected_rms"]:
+            ratio = format_number(worst["rms"] / worst["expected_rms"], 2)
+            text += f" ({ratio} times what noise and the parameters' uncertainty explain)"
+        return text
+    share = s["relative_error_percent"]
+    if share is None or not np.isfinite(share):
+        return "the prediction error is unknown, as no torque was measured"
+    return f"the prediction error is {format_percent(share)} of what was measured"
+
+
+def _fit_table(fit: Mapping[str, Any]) -> Table:
+    """Table of the fit of each torque, and of the correlations of its residual."""
+    rows = tuple(
+        (
+            name,
+            _percent(r["fit_percent"]),
+            _percent(r.get("noise_percent")),
+            format_number(r["rms"], 3),
+            r["unit"],
+            *(_correlation(r, key) for key in ("auto", "cross")),
+        )
+        for name, r in fit.items()
+    )
+    bounds = [r["bound"] for r in fit.values() if "bound" in r]
+    bound = f" White noise keeps 95 % of its correlations within +- {format_number(max(bounds), 2)}." if bounds else ""
+    caption = (
+        "Torques predicted from the measured motion, low-passed (not smoothed): fit, 100 % without an error; the fit"
+        " that the sensors' noise alone would leave; and how the residual is correlated with itself and with the"
+        f" predicted torque.{bound}"
+    )
+    names = ("torque", "fit [%]", "noise alone [%]", "rms error", "unit", "autocorrelation", "cross-correlation")
+    return Table(caption, names, rows)
+
+
+def _percent(value: float | None) -> str:
+    return "" if value is None else f"{value:.1f}"
+
+
+def _correlation(r: Mapping[str, Any], key: str) -> str:
+    """Give the largest correlation, and the share of lags beyond the bound."""
+    return f"{r[key]:.2f} ({r[f'{key}_outside']:.0f} % of lags beyond)" if key in r else ""
+
+
+def _budget_table(s: Summary) -> Table:
+    """Table of what makes each parameter's variance: noise, and the tolerances that matter most."""
+    rows = tuple(
+        (
+            name,
+            format_number(100 * shares["noise"], 2),
+            join_some([f"{source} {format_percent(100 * x)}" for source, x in shares.items() if source != "noise"][:3]),
+        )
+        for name, shares in s["budget"].items()
+    )
+    caption = (
+        "What makes the variance of each interval: noise with what the model lacks, and the tolerances of the machine"
+        " file that matter most. What takes a large share is worth measuring."
+    )
+    return Table(caption, ("parameter", "noise %", "tolerances"), rows, grey=s["status"] != "valid")
 
 
 def _joint_errors_table(by_joint: Mapping[str, Any]) -> Table:
@@ -225,7 +308,10 @@ def _judge_estimate(s: Summary, worst_percent: float | None, impossible: Sequenc
         return f"valid except for {join_some(lacking)}; a drive that shows more of the machine may give them."
     if worst_percent is None:
         return "valid, of unknown accuracy."
-    return f"valid, the 95 % intervals hold; every parameter is known to {format_percent(worst_percent)} or better."
+    lacks = ", ".join(f"{format_number(d['rms'], 2)} {d['unit']} in {n}" for n, d in s.get("discrepancy", {}).items())
+    although = f" although the model lacks {lacks}" if lacks else ""
+    accuracy = format_percent(worst_percent)
+    return f"valid, the 95 % intervals hold{although}; every parameter is known to {accuracy} or better."
 
 
 def validated_log(check: Mapping[str, Any]) -> str:

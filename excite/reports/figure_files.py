@@ -1,6 +1,7 @@
 """Files of figures: their formats, and a stated width in print with letters that stay readable.
 
-A command or `save` sets the files once (`writing_figures`), for every figure that is drawn inside.
+A command or `save` sets the files once (`writing_figures`), for every figure that is drawn inside. A figure asks
+`layout_width` how wide it is to be drawn: so it is laid out for its width in print, and then scaled as a whole.
 """
 
 from __future__ import annotations
@@ -8,7 +9,6 @@ from __future__ import annotations
 import itertools
 import re
 import textwrap
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -32,8 +32,8 @@ WIDTH = re.compile(r"(\d+(?:\.\d*)?)\s*(mm|cm)")
 MIN_WIDTH_MM, MAX_WIDTH_MM = 60.0, 420.0  # narrower than a column of any paper; long side of A3
 SCREEN_DPI, PRINT_DPI = 160, 300  # of a PNG without and with a stated width; chosen
 MIN_LETTERS_PT = 6.0  # smallest letters that journals print; chosen from guides that ask for 5 to 8 pt
+SMALLEST_PT = 8.0  # smallest letters of a figure on the screen, which are scaled to MIN_LETTERS_PT in print
 LEAST_SAID = 0.98  # share of MIN_LETTERS_PT below which a figure's letters are said to be small; chosen
-STEP = 1.08  # between widths at which a figure is laid out until its texts fit; chosen
 TOUCH_PX = 1.0  # by which boxes of texts may overlap: letters don't fill theirs
 TITLE_LETTER = 0.58  # width of a letter of the title as a share of its size, on average
 POINTS_PER_INCH = 72  # pt/in, definition
@@ -92,23 +92,26 @@ def writing_figures(files: FigureFiles) -> Iterator[None]:
         _files.reset(before)
 
 
-def write_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG at `path` and in the other formats beside it, at the width that `writing_figures` states.
+def layout_width(own: float) -> float:
+    """Return the width [in] at which a figure is drawn: its own on the screen, otherwise what its width in print asks.
 
-    A figure without a stated width is written as it is. Otherwise it is laid out anew, as narrow as its texts allow,
-    and scaled to the width.
+    Letters of SMALLEST_PT at that width are MIN_LETTERS_PT in print.
     """
+    width_mm = (_files.get() or FigureFiles()).width_mm
+    return own if width_mm is None else width_mm / MM_PER_INCH * SMALLEST_PT / MIN_LETTERS_PT
+
+
+def write_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG at `path` and in the other formats beside it, as `writing_figures` states."""
     files = _files.get() or FigureFiles()
-    scale = None if files.width_mm is None else _fit_width(figure, files.width_mm, path.stem, files.tell)
     for kind in files.formats:
-        write_file(figure, path.with_suffix(f".{kind}"), scale)
+        write_file(figure, path.with_suffix(f".{kind}"), _print_scale(figure, path.stem))
 
 
-def write_at_width(figure: Figure, path: Path, width: str | None, tell: Callable[[str], None]) -> None:
-    """Write a figure into a file (.png, .svg, .pdf) of a width in print, such as 88mm. Raises UsageError."""
+def write_alone(figure: Figure, path: Path) -> None:
+    """Write a figure into a file (.png, .svg, .pdf), at the width that `writing_figures` states. Raises UsageError."""
     read_formats("file", [path.suffix])
-    width_mm = None if width is None else read_width("figure_width", width)
-    write_file(figure, path, None if width_mm is None else _fit_width(figure, width_mm, path.stem, tell))
+    write_file(figure, path, _print_scale(figure, path.stem))
 
 
 def write_file(figure: Figure, path: Path, scale: float | None = None) -> None:
@@ -158,50 +161,29 @@ def wrap_title(figure: Figure, text: str, size: float) -> str:
     return "\n".join(textwrap.wrap(text, letters))
 
 
-def _fit_width(figure: Figure, width_mm: float, name: str, tell: Callable[[str], None]) -> float:
-    """Lay a figure out for a width in print, and return the scale that gives it.
+def _print_scale(figure: Figure, name: str) -> float | None:
+    """Return the scale that gives a figure its width in print, None without a stated one.
 
-    tell: takes a line if the smallest letters can't be as large as `MIN_LETTERS_PT`; name: what it calls the figure.
+    Tells of a figure whose smallest letters are below `MIN_LETTERS_PT`; name: what it is called then.
     """
-    width_in = width_mm / MM_PER_INCH
-    own_width, own_height = (float(x) for x in figure.get_size_inches())
-    texts = [t for t in figure.findobj(Text) if isinstance(t, Text) and t.get_visible() and t.get_text().strip()]
-    smallest = min((float(t.get_fontsize()) for t in texts), default=MIN_LETTERS_PT)
-    narrowest = width_in * max(1.0, smallest / MIN_LETTERS_PT)
-    layout = max(own_width, narrowest)
-    _lay_out(figure, layout, own_height)
-    # From wide to narrow: a layout that has failed leaves its traces in the figure.
-    while layout > narrowest:
-        _lay_out(figure, max(layout / STEP, narrowest), own_height)
-        if _has_faults(figure):
-            _lay_out(figure, layout, own_height)
-            break
-        layout = max(layout / STEP, narrowest)
-    scale = width_in / float(figure.get_figwidth())
-    letters = smallest * scale
+    files = _files.get() or FigureFiles()
+    if files.width_mm is None:
+        return None
+    scale = files.width_mm / MM_PER_INCH / float(figure.get_figwidth())
+    letters = smallest_letters(figure) * scale
     if letters < LEAST_SAID * MIN_LETTERS_PT:
-        enough = width_mm * MIN_LETTERS_PT / letters
-        tell(
-            f"{name}: letters of {format_number(letters, 2)} pt at {width_mm:g} mm; {MIN_LETTERS_PT:g} pt need"
+        enough = files.width_mm * MIN_LETTERS_PT / letters
+        files.tell(
+            f"{name}: letters of {format_number(letters, 2)} pt at {files.width_mm:g} mm; {MIN_LETTERS_PT:g} pt need"
             f" {enough:.0f} mm"
         )
     return scale
 
 
-def _lay_out(figure: Figure, width_in: float, height_in: float) -> None:
-    figure.set_size_inches(width_in, height_in)
-    title = figure.get_suptitle()
-    if title:
-        text: Text = figure._suptitle  # type: ignore[attr-defined]
-        text.set_text(wrap_title(figure, " ".join(title.split()), float(text.get_fontsize())))
-
-
-def _has_faults(figure: Figure) -> bool:
-    """Say whether texts are cut off or overlap, or a plot has no room left."""
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        found = next(text_faults(figure), None)
-    return found is not None or any("layout" in str(one.message) for one in said)  # no room for the plots
+def smallest_letters(figure: Figure) -> float:
+    """Return the size [pt] of the smallest visible letters of a figure; SMALLEST_PT without any."""
+    texts = [t for t in figure.findobj(Text) if isinstance(t, Text) and t.get_visible() and t.get_text().strip()]
+    return min((float(t.get_fontsize()) for t in texts), default=SMALLEST_PT)
 
 
 def _scale_svg(path: Path, figure: Figure, scale: float) -> None:

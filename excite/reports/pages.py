@@ -17,9 +17,9 @@ from excite.text import format_number
 REPORT = "report.html"
 
 CAPTIONS = {
-    "design.png": "The drive: torques in per cent of their limits, speeds [m/s], steered joints [rad] and the larger"
-    " slip [-] of both edges of each contact over time, dotted lines the limits; the most used share of each limit, in"
-    " per cent; where the machine steers, its path on the lane from above, dots the start.",
+    "design.png": "The drive: torques in per cent of their limits, speeds, angles and, of a machine on contacts, the"
+    " larger slip of both edges of each over time, dotted lines the limits; the most used share of each limit, in per"
+    " cent; of a machine that steers, its path from above, dots the start. Torques that swing fast have an excerpt.",
     "campaign.png": "What drives of each number and duration attain together, over the time of driving; the line is the"
     " target, the diamond the answer; grey, the first drive repeated, whose errors fall with the square root of time.",
     "sigma.png": "Attainable accuracy of the drive: one standard deviation (Cramer-Rao bound, all sensors together) of"
@@ -41,7 +41,7 @@ CAPTIONS = {
     "prediction.png": "Predicted signals over time, each with the 95 % band of the true signal shaded. Below each the"
     " band alone; along a log the residual in it, and in grey where 95 % of the readings are if the model is right.",
     "compare.png": "Drives side by side: condition number of Phi, and attainable standard deviation of the worst"
-    " parameter [%]; hatched drives break a limit that their label names.",
+    " parameter [%]; hollow points break a limit that their label names.",
     "slip.png": "Forces against slip: measured, one mark a row, and by the laws that the data support, beside the"
     " linear one. Right, the error of each law on settings left out of its fit, and the standard deviation of repeats.",
     "machine.png": "The machine from above: dots its centres of mass, green its measuring wheels, dashed with every"
@@ -64,9 +64,8 @@ CAPTIONS_BY_LOG = {
 }
 FIT_CAPTION = (
     "Measured and predicted drive torques, and their residual, over time, for {}. Each torque is predicted from the"
-    " motion that the log shows, by filtered derivatives: sensor noise, above all of slips, adds to the error of the"
-    " parameters. So the residual may be larger here than in the first sentence, which is of the method's own"
-    " prediction."
+    " motion that the log shows, by filtered derivatives: the sensors' noise adds to the error of the parameters, and"
+    " grey is what both explain."
 )
 
 
@@ -102,7 +101,7 @@ def folder_pictures(place: Path, summary: Summary, explorable: Mapping[str, Expl
     pictures = [
         Picture(
             path,
-            _caption(path.name, summary) + (ZOOM if path.name in made else ""),
+            _caption(path.name, summary) + (ZOOM if path.name in made and shown[path.name].whole else ""),
             made.get(path.name, ""),
             path.name in made and shown[path.name].whole,
             FOLDED.get(path.name.removesuffix(".png").partition("-")[0], ""),

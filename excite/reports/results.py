@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -120,9 +120,11 @@ class Shown:
         name = name or next(iter(drawn))
         if name not in drawn:
             raise UsageError(f"plot: {name} is unknown, allowed: {', '.join(drawn)}")
-        figure = drawn[name]()
-        if file is not None:
-            figure_files.write_at_width(figure, Path(file), figure_width, warn)
+        width = None if figure_width is None else figure_files.read_width("figure_width", figure_width)
+        with figure_files.writing_figures(figure_files.FigureFiles(width_mm=width, tell=warn)):
+            figure = drawn[name]()
+            if file is not None:
+                figure_files.write_alone(figure, Path(file))
         return figure
 
     def save(
@@ -174,7 +176,14 @@ class ShownVerification(Shown, Verification):
 
 
 class ShownEstimate(Shown, Estimate):
-    """Parameters identified from logs; fields as in `Estimate`."""
+    """Parameters identified from logs; fields as in `Estimate`. `estimate["M"]` is the row of a parameter."""
+
+    def __getitem__(self, name: str) -> pd.Series:
+        """Return value, standard deviation and interval of a parameter. Raises UsageError for an unknown name."""
+        table = self.to_frame()
+        if name not in table.index:
+            raise UsageError(f"estimate: {name} is unknown, allowed: {', '.join(table.index)}")
+        return cast(pd.Series, table.loc[name])
 
 
 class ShownPrediction(Shown, Prediction):

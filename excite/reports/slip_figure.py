@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,11 +12,12 @@ from matplotlib.figure import Figure
 
 from excite.identification import SlipFit, SlipLaw
 from excite.logs import SlipTable
-from excite.reports.figures import COLOURS, STYLES, escape_dollar
+from excite.reports.figures import COLOURS, STYLES, is_narrow, legend_below, new_figure, set_title, wrap_label
 from excite.text import format_number
 
 MAX_BARS = 10  # laws whose errors are drawn; chosen
 ANGLES_DIFFER = np.radians(2)  # chosen
+LAW_LETTERS = 22  # of a law's name in a line; chosen
 MARKERS = "osDv^<>"
 GREYS = ("black", "0.35", "0.6")
 
@@ -27,12 +29,19 @@ def slip_figure(fit: SlipFit, soil: SlipLaw | None, title: str) -> Figure:
     """
     roles = list(fit.table.forces)
     shown = list(dict.fromkeys((*fit.supported[:3], next((x for x in fit.laws if not x.parts), fit.laws[-1]))))
-    figure = Figure(figsize=(6.5 + 4.0 * len(roles), 4.8), layout="constrained")
-    figure.suptitle(escape_dollar(title), fontsize=11)
-    axes = figure.subplots(1, len(roles) + 1, width_ratios=(*[1.3] * len(roles), 1.0))
+    own = 6.5 + 4.0 * len(roles)
+    if is_narrow(own):
+        figure = new_figure(own, 2.8 * len(roles) + 4.8)
+        axes: Any = figure.subplots(len(roles) + 1, 1, height_ratios=(*[2.8] * len(roles), 4.2))
+    else:
+        figure = new_figure(own, 5.6)
+        axes = figure.subplots(1, len(roles) + 1, width_ratios=(*[1.3] * len(roles), 1.0))
+    set_title(figure, title)
     for column, (ax, role) in enumerate(zip(axes, roles, strict=False)):
         _curves(ax, fit.table, column, role, shown, soil)
     _bars(axes[-1], fit, soil)
+    key = [(handle, name) for ax in axes[[0, -1]] for handle, name in zip(*ax.get_legend_handles_labels(), strict=True)]
+    legend_below(figure, [handle for handle, _ in key], [name for _, name in key])
     return figure
 
 
@@ -58,8 +67,6 @@ def _curves(ax: Axes, table: SlipTable, column: int, role: str, laws: Sequence[S
     ax.set_xlabel(f"slip per {'rim speed' if table.per == 'rim' else 'larger speed'}, + driving [-]")
     ax.set_ylabel(f"{'side force' if role == 'side' else role} [N]")
     ax.grid(alpha=0.3)
-    if column == 0:
-        ax.legend(fontsize=7.5)
 
 
 def _along(table: SlipTable, at: np.ndarray) -> SlipTable:
@@ -91,11 +98,10 @@ def _bars(ax: Axes, fit: SlipFit, soil: SlipLaw | None) -> None:
     for y, law in zip(places, laws, strict=True):
         at = law.rms_left_out, y
         ax.annotate(format_number(at[0], 3), at, xytext=(3, 0), textcoords="offset points", va="center", fontsize=8)
-    ax.set_yticks(places, [x.name.replace(" + ", "\n+ ") for x in laws], fontsize=7)
+    ax.set_yticks(places, [wrap_label(x.name, LAW_LETTERS) for x in laws], fontsize=8)
     known = [r for r in fit.repeatability.values() if r is not None]
     if known:
         ax.axvline(max(known), color="black", linestyle="--", linewidth=0.9, label="repeatability")
-        ax.legend(fontsize=8)
-    ax.set_xlabel("error on settings left out [N, rms]\ngreen: supported")
-    ax.set_xlim(0, 1.15 * max(x.rms_left_out for x in laws))
+    ax.set_xlabel("error on settings left out\n[N, rms], green: supported")
+    ax.set_xlim(0, 1.3 * max(x.rms_left_out for x in laws))
     ax.grid(axis="x", alpha=0.3)

@@ -11,9 +11,12 @@ from matplotlib.patches import Polygon
 
 from excite.model import mechanics
 from excite.model.machine import Body, Machine
-from excite.reports.figures import COLOURS, escape_dollar
+from excite.reports.figure_files import layout_width
+from excite.reports.figures import COLOURS, is_narrow, new_figure, set_title, wrap_label
 
 POINT_WIDTH = 0.25  # drawn width of a point contact over its radius; chosen
+NAME_LETTERS = 16  # of a contact's name in a line; chosen
+NEAR_JOINTS = 0.3  # of a machine's length, between joints whose names are written below each other; chosen
 FRAME, GHOST = "0.55", "0.6"
 
 
@@ -24,9 +27,9 @@ def top_view_figure(machine: Machine) -> Figure:
     """
     if not machine.planar:
         raise ValueError(f"{machine.name}: does not move on the plane, so there is nothing to see from above")
-    fig = Figure(figsize=(9, 6), layout="constrained")
+    fig = new_figure(9, layout_width(9) * (0.8 if is_narrow(9) else 2 / 3))
     ax = fig.subplots()
-    fig.suptitle(escape_dollar(machine.title), fontsize=11)
+    set_title(fig, machine.title)
     draw_machine(ax, machine)
     return fig
 
@@ -51,8 +54,12 @@ def draw_machine(ax: Axes, machine: Machine) -> None:
             assert s.lateral is not None
             shape = _footprint(*poses[s.body], float(s.radius), 0.2 * float(s.radius), float(s.lateral))
             ax.add_patch(Polygon(shape, closed=True, facecolor="none", edgecolor=COLOURS[2], zorder=4))
-    ax.set_aspect("equal")
-    ax.margins(0.1)
+    ax.set_aspect("equal", adjustable="datalim")
+    lines = max((wrap_label(b.where.replace("_", " "), NAME_LETTERS).count("\n") for b in machine.contacts), default=0)
+    (left, low), (right, high) = ax.dataLim.get_points()
+    names = (0.12 + 0.2 * lines) * (high - low)  # room for them
+    ax.update_datalim([(left, low - names), (right, high + names)])
+    ax.margins(0.05)
     ax.autoscale_view()
     ax.set_xlabel("x, forward [m]")
     ax.set_ylabel("y, left [m]")
@@ -102,13 +109,13 @@ def _contacts(ax: Axes, machine: Machine, q: Mapping[str, float], ghost: bool) -
         )
         left = place[1] > -1e-6
         ax.annotate(
-            b.where.replace("_", " ") + ("" if driven else " (not driven)"),
+            wrap_label(b.where.replace("_", " ") + ("" if driven else " (not driven)"), NAME_LETTERS),
             (place[0], shape[:, 1].max() if left else shape[:, 1].min()),
             xytext=(0, 2 if left else -2),
             textcoords="offset points",
             ha="center",
             va="bottom" if left else "top",
-            fontsize=7.5,
+            fontsize=8,
         )
 
 
@@ -120,6 +127,7 @@ def _footprint(turned: np.ndarray, place: np.ndarray, radius: float, width: floa
 
 def _joints(ax: Axes, machine: Machine, poses: Mapping[int, tuple[np.ndarray, np.ndarray]]) -> None:
     taken: list[np.ndarray] = []
+    length = float(np.ptp([place[0] for _, place in poses.values()]))
     for b in machine.body:
         if b.contact is not None or b.joint in ("planar", "fixed"):
             continue
@@ -129,7 +137,7 @@ def _joints(ax: Axes, machine: Machine, poses: Mapping[int, tuple[np.ndarray, np
         words = b.where.replace("_", " ") + (
             " (held)" if held else "" if b.actuated or b.driven_with or b.moves_with else " (free)"
         )
-        row = sum(np.allclose(place, other, atol=0.05) for other in taken)
+        row = sum(np.allclose(place, other, atol=NEAR_JOINTS * length) for other in taken)
         taken.append(place)
         ax.annotate(
             words,
@@ -138,7 +146,7 @@ def _joints(ax: Axes, machine: Machine, poses: Mapping[int, tuple[np.ndarray, np
             textcoords="offset points",
             ha="center",
             va="top",
-            fontsize=7.5,
+            fontsize=8,
             color=COLOURS[1],
             zorder=7,
         )

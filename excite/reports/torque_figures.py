@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from excite.diagnosis import Curve, TorqueDiagnosis
-from excite.reports.figures import COLOURS, escape_dollar, set_title, wrap_label
+from excite.reports.figure_files import layout_width
+from excite.reports.figures import COLOURS, is_narrow, legend_below, new_figure, set_title, wrap_label
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
 MAX_TORQUES = 4  # with the largest errors, in the figure; chosen
 BINS = 40  # of time or speed in a panel; chosen
-MAX_COLUMNS = 3  # curves side by side; chosen
+MAX_COLUMNS, MIN_CURVE_IN = 3, 3.0  # curves side by side, and the width of one [in]; chosen
 
 
 def torque_figures_by_file(d: TorqueDiagnosis, title: str) -> dict[str, Callable[[], Figure]]:
@@ -30,8 +32,10 @@ def misfit_of_torques(d: TorqueDiagnosis, title: str) -> Figure:
     names = d.torques
     rows = list(model.actuated)
     order = sorted(range(len(rows)), key=lambda k: -before.level[rows[k]] / before.lowest[rows[k]])[:MAX_TORQUES]
-    figure = Figure(figsize=(10.0, 0.9 + 2.0 * len(order)), layout="constrained")
-    axes = figure.subplots(len(order), 2, squeeze=False)
+    narrow = is_narrow(10.0)
+    figure = new_figure(10.0, 0.9 + (3.4 if narrow else 2.0) * len(order))
+    grid: Any = figure.subplots(len(order) * (2 if narrow else 1), 1 if narrow else 2, squeeze=False)
+    axes = grid.reshape(len(order), 2)
     for (over_time, over_speed), k in zip(axes, order, strict=True):
         name, unit = names[k]
         row, body = rows[k], model.machine.actuated[k]
@@ -55,11 +59,15 @@ def misfit_of_torques(d: TorqueDiagnosis, title: str) -> Figure:
         over_time.set_ylabel(wrap_label(f"rms error of {name} [{unit}]"))
         over_time.set_ylim(bottom=0.0)
         over_speed.set_ylabel(wrap_label(f"mean error of {name} [{unit}]"))
-        over_speed.set_xlabel(escape_dollar(f"speed of {body.where.replace('_', ' ')} [{'rad/s' if turns else 'm/s'}]"))
+        signal = f"speed of {body.where.replace('_', ' ')} [{'rad/s' if turns else 'm/s'}]"
+        over_speed.set_xlabel(wrap_label(signal, 44), fontsize=9)
     axes[-1, 0].set_xlabel("time [s]" if len(d.sources) == 1 else "time, one log after the other [s]")
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+    legend_below(figure, handles, labels)
     set_title(figure, f"{title}: errors of the torques along the measured motion")
+    for ax in figure.axes:
+        ax.tick_params(labelsize=8)
+        ax.yaxis.label.set_fontsize(8)
     return figure
 
 
@@ -76,14 +84,16 @@ def _means(x: np.ndarray, y: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, 
 def curves_figure(d: TorqueDiagnosis, title: str) -> Figure:
     """Plot the torque that each joint lacks as a function of one signal, with its 95 % band."""
     columns = min(MAX_COLUMNS, len(d.curves))
+    own = max(3.6 * columns + 0.4, 6.4)
+    columns = min(columns, max(1, int(layout_width(own) / MIN_CURVE_IN)))
     lines = -(-len(d.curves) // columns)
-    figure = Figure(figsize=(max(3.6 * columns + 0.4, 6.4), 2.8 * lines + 0.7), layout="constrained")
+    figure = new_figure(own, 2.6 * lines + 0.9)
     axes = figure.subplots(lines, columns, squeeze=False).ravel()
     for axis, curve in zip(axes, d.curves, strict=False):
         _draw_curve(axis, curve)
     for axis in axes[len(d.curves) :]:
         axis.set_axis_off()
-    figure.suptitle(escape_dollar(f"{title}:\ntorque that the model lacks, mean and 95 % band"))
+    set_title(figure, f"{title}: torque that the model lacks, mean and 95 % band")
     return figure
 
 
@@ -94,5 +104,6 @@ def _draw_curve(axis: Axes, curve: Curve) -> None:
     )
     axis.plot(curve.at, curve.value, color=AFTER)
     axis.axhline(0.0, color="0.5", linewidth=0.8)
-    axis.set_xlabel(escape_dollar(f"{signal.removeprefix('the ').replace('_', ' ')} [{of}]"))
-    axis.set_ylabel(escape_dollar(f"missing in {row} [{unit}]"))
+    axis.set_xlabel(wrap_label(f"{signal.removeprefix('the ').replace('_', ' ')} [{of}]", 34), fontsize=9)
+    axis.set_ylabel(wrap_label(f"missing in {row} [{unit}]", 28), fontsize=9)
+    axis.tick_params(labelsize=8)

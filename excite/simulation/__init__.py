@@ -4,7 +4,8 @@
 follows one of `FRICTION_LAWS`: smoothed at reversals, or set-valued, so that joints stick. `follow` puts a person at
 the levers, a `Driver` with preview, delay and slow errors. `measure` turns a motion into the log of a sensor kit
 (`KITS`) with quantisation, noise and offsets; `exact_readings` leaves these out. `measured_torques` and
-`delivered_torques` convert between the motors' torques and the readings of their channels. `share_outside_law` says how
+`delivered_torques` convert between the motors' torques and the readings of their channels (`smooth_part`: without
+most of their noise). `share_outside_law` says how
 much of a motion lies beyond the linear soil law.
 
 `play_back` simulates a drive as its machine follows it: arms under gravity follow positions (`follow_positions`,

@@ -30,6 +30,7 @@ from .sensors import (
     measure as measure,
     measured_torque as measured_torque,
     measured_torques as measured_torques,
+    smooth_part as smooth_part,
 )
 from .slip import (
     outside_law as outside_law,

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
+import scipy
 
 from excite.model import Model, machine
 from excite.model.machine import Sensor
@@ -36,7 +37,7 @@ def measure(
         if sensor.loop is not None:
             read = machine.before_loop(sensor.loop, read, 1 / float(model.machine.sampling_hz))
         if noise:
-            read = _with_sensor_errors(sensor, read, rng)
+            read = _with_sensor_errors(sensor, read, machine.noise_of(model.machine, sensor), rng)
         if sensor.rate_hz is not None:
             read = np.where(_reads_in_row(motion.t, float(sensor.rate_hz)), read, np.nan)
         columns |= _as_columns(sensor, read, _joint_angle(model, motion, sensor))
@@ -105,8 +106,24 @@ def measured_torque(
 def delivered_torque(
     t: np.ndarray, read: np.ndarray, gain: np.ndarray, offset: np.ndarray, delay: np.ndarray
 ) -> np.ndarray:
-    """Return the delivered torque (N,) [N m] behind the readings (N,) of a channel; gain, offset, delay [s]: (N,)."""
-    return np.asarray((np.interp(t + delay, t, read) - offset) / gain)
+    """Return the delivered torque (N,) [N m] behind the readings (N,) of a channel; gain, offset, delay [s]: (N,).
+
+    A delay shifts the smooth part only: noise that is shifted between samples would be averaged, and every delay but
+    zero would seem to explain it.
+    """
+    if np.any(delay):
+        smooth = smooth_part(read)
+        late = np.clip(t + delay, t[0], t[-1])
+        read = read + scipy.interpolate.CubicSpline(t, smooth)(late) - smooth
+    return np.asarray((read - offset) / gain)
+
+
+SMOOTHING_SAMPLES = 4  # standard deviation of the window that leaves the smooth part of readings; chosen
+
+
+def smooth_part(read: np.ndarray) -> np.ndarray:
+    """Return the smooth part of readings (N, ...), without most of their noise."""
+    return np.asarray(scipy.ndimage.gaussian_filter1d(read, SMOOTHING_SAMPLES, axis=0))
 
 
 def delivered_torques(t: np.ndarray, read: np.ndarray, channels: Sequence[np.ndarray]) -> np.ndarray:
@@ -117,8 +134,8 @@ def delivered_torques(t: np.ndarray, read: np.ndarray, channels: Sequence[np.nda
     return np.column_stack([delivered_torque(t, *each) for each in zip(read.T, *channels, strict=True)])
 
 
-def _with_sensor_errors(sensor: Sensor, exact: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Add quantisation or noise to exact readings (N,)."""
+def _with_sensor_errors(sensor: Sensor, exact: np.ndarray, std: float, rng: np.random.Generator) -> np.ndarray:
+    """Add quantisation or noise to exact readings (N,). std [SI]: of the noise."""
     step = sensor.resolution
     if step is not None:
         phase = rng.uniform()
@@ -126,7 +143,7 @@ def _with_sensor_errors(sensor: Sensor, exact: np.ndarray, rng: np.random.Genera
         return (counts - counts[0]) * step + np.round(exact[0] / step) * step
     read = exact
     if sensor.noise is not None:
-        read = exact + float(sensor.noise) * rng.standard_normal(len(exact))
+        read = exact + std * rng.standard_normal(len(exact))
     if sensor.kind == "ground_speed":
         read = np.abs(read)
     if sensor.step is not None:

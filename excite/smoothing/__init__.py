@@ -5,8 +5,9 @@ numerical method; `excite.identification` and `excite.diagnosis` decide what to 
 
 - `build_state_space` turns a model and its sensors into a `StateSpace`: states, readings and their derivatives.
 - `prepare_measurements` and `initial_trajectory` turn a log into `Measurements` and a first `Trajectory`.
-- `fit_logs` finds the most likely parameters and trajectories by Gauss-Newton and returns a `Fit`, or raises
-  `NotConvergedError`. Each pass linearises every log (`LinearisedLog`) and smooths it with the parallel smoother.
+- `fit_logs` finds the most likely parameters and trajectories by Levenberg-Marquardt and returns a `Fit` with a status.
+  Each pass linearises every log (`LinearisedLog`) and smooths it with the parallel smoother.
+- `fit_unknown_forces` does so beside forces that the model lacks, whose sizes it finds by marginal likelihood.
 - `quantify_uncertainty` adds encoder errors and profile likelihood to a fit's covariance.
 - `innovation_statistics` says whether model and noise explain a log; `whiten` and `whiten_signatures` give the
   innovations with which other effects are tested.

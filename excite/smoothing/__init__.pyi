@@ -1,23 +1,7 @@
 from .cramer_rao import cramer_rao as cramer_rao
-from .gauss_newton import (
-    ACCEPTABLE_STEP as ACCEPTABLE_STEP,
-    CLOSE_FIT_COST_RATIO as CLOSE_FIT_COST_RATIO,
-    INITIAL_DAMPING as INITIAL_DAMPING,
-    MAX_IDENTIFIABLE_STD as MAX_IDENTIFIABLE_STD,
-    MAX_PASSES as MAX_PASSES,
-    PRIOR_STD as PRIOR_STD,
-    RESUMED_DAMPING as RESUMED_DAMPING,
-    SETTLING_PASSES as SETTLING_PASSES,
-    SUFFICIENT_STEP as SUFFICIENT_STEP,
-    Fit as Fit,
-    NotConvergedError as NotConvergedError,
-    apply_step as apply_step,
-    covariance_in_si as covariance_in_si,
-    fit_logs as fit_logs,
-    linearise_log as linearise_log,
-    linearise_logs as linearise_logs,
-    prior_information as prior_information,
-    prior_terms as prior_terms,
+from .forward import (
+    PROCESS_NOISE_LEVELS as PROCESS_NOISE_LEVELS,
+    interpolate as interpolate,
     state_scale as state_scale,
 )
 from .innovations import (
@@ -28,13 +12,28 @@ from .innovations import (
     whiten as whiten,
     whiten_signatures as whiten_signatures,
 )
+from .inverse_chain import torque_sensors as torque_sensors
+from .inverse_fit import InverseFit as InverseFit, InverseSettings as InverseSettings, fit_inverse as fit_inverse
 from .linearisation import (
     BATCH_SIZE as BATCH_SIZE,
     BatchedFunction as BatchedFunction,
     StateSpace as StateSpace,
-    advance as advance,
     build_state_space as build_state_space,
-    differentiate as differentiate,
+)
+from .log_fit import (
+    ACCEPTABLE_STEP as ACCEPTABLE_STEP,
+    MAX_IDENTIFIABLE_STD as MAX_IDENTIFIABLE_STD,
+    PRIOR_STD as PRIOR_STD,
+    Fit as Fit,
+    NotConvergedError as NotConvergedError,
+    apply_step as apply_step,
+    covariance_in_si as covariance_in_si,
+    fit_logs as fit_logs,
+    linearise_logs as linearise_logs,
+    newton_step as newton_step,
+    parameter_indices as parameter_indices,
+    prior_information as prior_information,
+    prior_terms as prior_terms,
 )
 from .measurements import (
     Measurements as Measurements,
@@ -52,4 +51,12 @@ from .measurements import (
     transfer_trajectory as transfer_trajectory,
     with_mean_edge_rates as with_mean_edge_rates,
 )
+from .sizes import FitBeside as FitBeside, fit_unknown_forces as fit_unknown_forces, lacks_forces as lacks_forces
+from .solver import Settings as Settings
+from .transitions import (
+    Transitions as Transitions,
+    differentiate as differentiate,
+    integrate as integrate,
+)
 from .uncertainty import quantify_uncertainty as quantify_uncertainty
+from .unknown_forces import Missing as Missing, describe_missing as describe_missing

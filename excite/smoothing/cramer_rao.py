@@ -11,10 +11,11 @@ from dataclasses import replace
 import numpy as np
 
 from excite.model import Model
-from excite.model.machine import Sensor
+from excite.model.machine import Machine, Sensor, noise_of
 from excite.simulation import Motion, measured_torques
-from excite.smoothing.gauss_newton import PRIOR_STD, covariance_in_si, linearise_log
+from excite.smoothing import forward
 from excite.smoothing.linearisation import StateSpace, build_state_space
+from excite.smoothing.log_fit import PRIOR_STD, covariance_in_si
 from excite.smoothing.measurements import (
     LEAST_GROUND_SPEED,
     Measurements,
@@ -24,6 +25,7 @@ from excite.smoothing.measurements import (
     torque_sensor,
     with_mean_edge_rates,
 )
+from excite.smoothing.unknown_forces import no_unknown_forces
 
 
 def cramer_rao(
@@ -58,8 +60,8 @@ def cramer_rao(
     counts = np.array([s.resolution is not None for s in space.sensors])
     torques = [torque_sensor(model, b.index) for b in model.machine.actuated]
     noise = SensorNoise(
-        np.array([float(s.noise or 0) * factors.get(s.name, 1) for s in torques]),
-        np.array([_noise(s) * factors.get(s.name, 1) for s in space.sensors]),
+        np.array([noise_of(model.machine, s) * factors.get(s.name, 1) for s in torques]),
+        np.array([_noise(model.machine, s) * factors.get(s.name, 1) for s in space.sensors]),
     )
     none = np.zeros((len(state), len(space.sensors)))
     data = Measurements(
@@ -68,8 +70,9 @@ def cramer_rao(
     trajectory = Trajectory(state, np.zeros_like(motion.u[1:]), np.zeros(len(data.offset_sensors)), over)
     data = with_mean_edge_rates(space, data, trajectory, motion.u, X)
     data = replace(data, used=data.used * _shares_read(space, state, noise, X))
-    linear = linearise_log(space, data, trajectory, state[0], X, 0.0, exact=True)
-    assert linear is not None
+    along = forward.evaluate(space, data, trajectory, state[0], X, no_unknown_forces(space, 1).lacking[0], exact=True)
+    assert along is not None
+    linear = forward.linearise(space, along, state[0], X)
     information = linear.Z[1:, 1:].copy()
     information[: len(X), : len(X)] += model.known.information(model.scale)
     information[np.diag_indices(len(information))] += np.concatenate(
@@ -78,9 +81,9 @@ def cramer_rao(
     return covariance_in_si(space, np.linalg.inv(information))
 
 
-def _noise(sensor: Sensor) -> float:
+def _noise(machine: Machine, sensor: Sensor) -> float:
     """Return the standard deviation of a sensor [SI], for an encoder its count."""
-    return sensor.resolution or float(np.hypot(float(sensor.noise or 0), sensor.least_noise))
+    return sensor.resolution or float(np.hypot(noise_of(machine, sensor), sensor.least_noise))
 
 
 def _shares_read(space: StateSpace, state: np.ndarray, noise: SensorNoise, X: np.ndarray) -> np.ndarray:

@@ -42,12 +42,16 @@ class LinearisedLog:
 
     chain: solution of the smoother. Z: twice the negative log-likelihood is [1 p]' Z [1 p] for scaled steps p of
     parameters and offsets.
-    gain (N - 1, n, n_u): effect of one standard deviation of torque noise on the scaled state.
+    gain (N - 1, n, n_e): effect of one standard deviation of each white error on the scaled state.
     elements: elements of the chain, part by part.
     H (N, m, n), weight, residual (N, m): slopes, 1 / variance and residual of the readings.
     direct (N, m, n_f + n_o): slopes of the readings by the parameters they depend on directly, and by offsets.
-    noise (N - 1, n_u): standard deviation of the delivered torques [N m].
+    noise (N - 1, n_e): standard deviation of the white errors: delivered torques [N m], then forces.
     beat_inflation (N, m): variance of the readings relative to 1 / weight where encoder errors beat.
+    direct_columns: columns of the chain that `direct` belongs to.
+    acting (n_e,): places of the white errors in `gain` and `noise` among all torques and forces.
+    process (N - 1, n, n_forced): effect of one standard deviation of process noise on the scaled state, None if none.
+    closing (N - 1, n, n): what defects are multiplied by in the chain (`forward.close`), None if by one.
     """
 
     chain: parallel_smoother.SmoothedChain
@@ -60,6 +64,10 @@ class LinearisedLog:
     direct: np.ndarray
     noise: np.ndarray
     beat_inflation: np.ndarray
+    acting: np.ndarray
+    direct_columns: np.ndarray
+    process: np.ndarray | None = None
+    closing: np.ndarray | None = None
 
     @cached_property
     def innovations(self) -> np.ndarray:
@@ -136,19 +144,12 @@ def _batches(linear: LinearisedLog) -> Iterator[tuple[slice, slice]]:
         first, begin = last, int(ends[last - 1])
 
 
-def whiten(linear: LinearisedLog, reading_parameters: tuple[int, ...]) -> WhitenedInnovations:
+def whiten(linear: LinearisedLog) -> WhitenedInnovations:
     """Filter data, parameters and offsets to white innovations, in single precision.
 
     The products of the columns are the information about parameter steps with all states integrated out.
-    reading_parameters: parameters that readings depend on directly.
     """
     (N, m, n), count = linear.H.shape, linear.chain.Z.shape[0]
-    direct_columns = np.concatenate(
-        [
-            1 + np.array(reading_parameters, int),
-            np.arange(count - linear.direct.shape[2] + len(reading_parameters), count),
-        ]
-    )
     E, start_response = np.empty((N, m, count), np.float32), np.empty((N, m, n), np.float32)
     begin, transitions = linear.chain.parts[0].total.b[0], list[np.ndarray]()
     for parts, samples in _batches(linear):
@@ -156,7 +157,7 @@ def whiten(linear: LinearisedLog, reading_parameters: tuple[int, ...]) -> Whiten
         K = samples.stop - samples.start
         reading, push = np.zeros((K, m, count + n)), np.zeros((K, n, count + n))
         reading[:, :, 0] = -linear.residual[samples]
-        reading[:, :, direct_columns] = linear.direct[samples]
+        reading[:, :, linear.direct_columns] = linear.direct[samples]
         push[:, :, :count] = np.concatenate([x.b for x in elements])
         x = np.zeros((len(elements), n, count + n))
         x[:, :, count:] = np.eye(n)

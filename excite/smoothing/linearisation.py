@@ -1,16 +1,13 @@
-"""State space of a machine and its sensors: transition from sample to sample, and its derivatives.
+"""State space of a machine and its sensors: rates of its states and readings, with their derivatives.
 
-All samples of a log are evaluated in batches. Transitions use the simulator's own step. Their derivatives weigh
-residuals only and need three digits: one step of Radau IIA of order 3 solves the variational equation (Hairer and
-Wanner, "Solving Ordinary Differential Equations II", IV.5). The method is L-stable, as a stiff contact at standstill
-demands, and exact in the steady state.
+All samples of a log are evaluated in batches.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 
 import casadi as ca
 import numpy as np
@@ -18,34 +15,12 @@ import scipy.special
 
 from excite.model import Model
 from excite.model.machine import Sensor
-from excite.simulation import (
-    A_ROWS,
-    C_ROWS,
-    GAMMA,
-    STAGE_TIMES,
-    TIME_DERIVATIVE_WEIGHTS,
-    Motion,
-    delivered_torques,
-    lu,
-    lu_solve,
-)
+from excite.simulation import Motion, delivered_torques, smooth_part
 
-# Error of a speed over one interval [rad/s, m/s], and of an effect's memory relative to its size. The torque noise of
-# one sample does far more; chosen.
-STEP_TOLERANCE = 1e-5
 POSE_STD = (1e3, 1e3, 10.0)  # of a pose at the start of a log, of which nothing is known [m, m, rad]; chosen
 BATCH_SIZE = 1000  # samples whose intermediate results stay in the processor's cache; measured
 MIN_BLOCK_SAMPLES = 80  # from this many samples on, the evaluation by numpy is faster; measured
 CASADI_SAMPLES = 20  # in one call of CasADi for fewer samples; measured
-REVERSAL_STEPS = 4  # steps in an interval in which friction changes sign; chosen
-ABRUPT_REVERSAL_STEPS = 16  # steps in an interval in which it does so abruptly; chosen
-REVERSAL_CHANGE = 0.3  # change of speed over the friction's smoothing speed that asks for finer steps; chosen
-REVERSAL_RANGE = 4.0  # distance from zero speed, over the smoothing speed, within which friction varies; from tanh
-ABRUPT_CHANGE = 1.5  # the same ratio, from which a reversal is abrupt; chosen
-MAX_SPLITS = 6  # halvings of an interval; chosen
-# Mean steps for an interval, in logs longer than BATCH_SIZE. Guesses that lead to a fit take up to 8; a motion that
-# takes more has diverged.
-MAX_MEAN_STEPS = 12
 
 
 class BatchedFunction:
@@ -233,6 +208,7 @@ class StateSpace:
     """States of a machine that its forces and a set of sensors depend on, with their dynamics and readings.
 
     sensors: those with a reading h(s), in order.
+    forces: inputs beside the torques (see `unknown_inputs`).
     core: number of leading states on which forces depend (coordinates, velocities, memory of effects). Measured angles
         that are integrals of these follow.
     index (n,): places of the states in the simulator's state (q, nu, wheels, z) of size full_size.
@@ -243,12 +219,13 @@ class StateSpace:
     reading_parameters: parameters that readings depend on directly.
     initial_std (n,): standard deviation of states whose start is known, NaN for the others.
     readings_use_torque: whether readings depend on the torque at the same sample.
-    jacobians, readings, rosenbrock_step, pivots, channels: batched functions of (state, inputs, X). Inputs from a map
-        of the ground are no states and stand beside the torques (`inputs`).
+    jacobians, readings, rates, slopes, pivots, channels: batched functions of (state, inputs, X). Inputs from a map of
+        the ground are no states and stand beside the torques (`inputs`).
     """
 
     model: Model
     sensors: tuple[Sensor, ...]
+    forces: tuple[tuple[int, str], ...]
     core: int
     index: np.ndarray
     full_size: int
@@ -261,14 +238,33 @@ class StateSpace:
     readings_use_torque: bool
     jacobians: BatchedFunction
     readings: BatchedFunction
-    rosenbrock_step: BatchedFunction
+    rates: BatchedFunction
+    slopes: BatchedFunction
     pivots: BatchedFunction
     channels: BatchedFunction
+    features: BatchedFunction
 
     @property
     def n(self) -> int:
         """Number of states."""
         return len(self.index)
+
+    @cached_property
+    def soil(self) -> np.ndarray:
+        """Matrix (n_stiffness, n_base) that gives the stiffnesses Kx, Ky of the contacts, which are below zero."""
+        base, bodies = self.model.base, [b.index for b in self.model.machine.contacts]
+        names = [f"K{axis}{k}" for k in bodies for axis in "xy" if f"K{axis}{k}" in base.standard]
+        return self.model.expand[[base.standard.index(n) for n in names]].reshape(-1, len(base.names))
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs: torques, those from a map of the ground, forces."""
+        return len(self.model.inputs) + len(self.model.map_inputs) + len(self.forces)
+
+    @property
+    def input_columns(self) -> np.ndarray:
+        """Indices of torques and forces among the inputs."""
+        return np.delete(np.arange(self.n_inputs), slice(len(self.model.inputs), self.n_inputs - len(self.forces)))
 
     def unpack(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Split states (N, n) into coordinates, velocities (N, n_q) and memory (N, n_z).
@@ -289,31 +285,35 @@ class StateSpace:
         """Return the states (N, n) and inputs from a map of the ground (N, n_ground) of a simulated motion."""
         return self.from_full_state(np.hstack([motion.q, motion.nu, motion.wheels, motion.memory]))
 
-    def inputs(self, torque: np.ndarray, ground: np.ndarray) -> np.ndarray:
-        """Join torques (N, n_u) and inputs from a map of the ground (N, n_ground)."""
-        return np.concatenate([torque, ground], axis=1) if self.model.map_inputs else torque
+    def inputs(self, torque: np.ndarray, ground: np.ndarray, force: np.ndarray | None = None) -> np.ndarray:
+        """Join torques (N, n_u), inputs from a map of the ground (N, n_ground) and forces (N, n_forces), 0 if None."""
+        if force is None:
+            force = np.zeros((len(torque), len(self.forces)))
+        return np.concatenate([torque, ground, force], axis=1) if self.model.map_inputs or self.forces else torque
 
     def delivered_torques(
-        self, torque: np.ndarray, X: np.ndarray, torque_error: np.ndarray | float = 0.0
+        self, torque: np.ndarray, X: np.ndarray, torque_error: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the delivered torques (N, n_u) [N m] from measured ones, and their slopes by X (N, n_u, n_base).
+        """Compute the delivered torques (N, n_u) [N m] from measured ones, and the slopes by X of their means over each
+        interval (N - 1, n_u, n_base).
 
-        torque_error (N, n_u) [N m]: known errors of the torques. Slopes by a gain or a delay use the corrected
-        torques, as slopes from noisy ones would follow the noise and bias the estimate.
+        torque_error (N - 1, n_u) [N m]: known errors of the torques in each interval. Slopes by a gain or a delay use
+        the corrected torques, as slopes from noisy ones would follow the noise and bias the estimate.
         """
         if not any(e.effect.channel for e in self.model.effects):
-            return torque - X @ self.torque_offsets.T, np.broadcast_to(
-                -self.torque_offsets, (len(torque), *self.torque_offsets.shape)
-            )
+            slope = np.broadcast_to(-self.torque_offsets, (len(torque) - 1, *self.torque_offsets.shape))
+            return torque - X @ self.torque_offsets.T, slope
         step = 1 / float(self.model.machine.sampling_hz)
         t = np.arange(len(torque)) * step
         *channels, by_gain, by_offset, by_delay = self.channels(t[:, None], X)
         gain, offset, delay = (e[:, :, 0] for e in channels)
         u = delivered_torques(t, torque, (gain.T, offset.T, delay.T))
-        corrected = u + torque_error
-        rise = np.gradient(gain * corrected + offset, step, axis=0)
-        slope = (rise[:, :, None] * by_delay - by_offset - corrected[:, :, None] * by_gain) / gain[:, :, None]
-        return u, slope
+        error = np.zeros((len(t) - 1, u.shape[1])) if torque_error is None else torque_error
+        corrected = u + np.concatenate([error, error[-1:]])
+        rise = np.gradient(smooth_part(gain * corrected + offset), step, axis=0)
+        behind = rise[:, :, None] * by_delay - by_offset - u[:, :, None] * by_gain
+        behind = (behind[:-1] + behind[1:]) / 2 - error[:, :, None] * by_gain[:-1]
+        return u, behind / gain[:-1, :, None]
 
     def delivered_noise(self, noise: np.ndarray, X: np.ndarray) -> np.ndarray:
         """Convert the noise of the torque sensors (n_u,) to noise of the delivered torques [N m]."""
@@ -323,25 +323,12 @@ class StateSpace:
         return noise / np.abs(gain)
 
 
-@dataclass(frozen=True)
-class TransitionJacobians:
-    """Derivatives of the state at the end of each of K intervals.
-
-    A (K, n, n): by the state at its start. B (K, n, n_u): by a torque constant in it. X (K, n, n_base): by base
-    parameters at fixed delivered torque. F (K, n, n_forced): by a constant force on each forced row.
-    """
-
-    A: np.ndarray
-    B: np.ndarray
-    X: np.ndarray
-    F: np.ndarray
-
-
 @lru_cache(maxsize=16)
-def build_state_space(model: Model, names: tuple[str, ...]) -> StateSpace:
+def build_state_space(model: Model, names: tuple[str, ...], forces: bool = False) -> StateSpace:
     """Build the state space of a model and the sensors with these names.
 
-    Torque sensors are left out. The pose on the ground is a state if a sensor reads it.
+    Torque sensors are left out. The pose on the ground is a state if a sensor reads it. forces: whether the forces that
+    the soil may add to its law, and a slope of the ground, are inputs.
     """
     machine = model.machine
     n_q, n_u = len(model.coordinates), len(model.inputs)
@@ -355,7 +342,11 @@ def build_state_space(model: Model, names: tuple[str, ...]) -> StateSpace:
 
     M, bias = model.equations(q, nu, X, u, z)
     forced_rows = tuple(k for k in range(n_q) if k not in model.actuated) or tuple(range(n_q))
+    added = unknown_inputs(model) if forces else ()
+    extra = ca.SX.sym("f", len(added))
     load = model.joint_torques(u)
+    if added:
+        load += _unknown_load(model, q, M, X, added) @ extra
     factors = ca.ldl(M)
     a = ca.ldl_solve(load - bias, *factors)
     flow = model.flow(q, nu, u, z, X)
@@ -388,7 +379,7 @@ def build_state_space(model: Model, names: tuple[str, ...]) -> StateSpace:
     for k, at in enumerate(index):
         full_values[at] = state[k]
     full_values[last:] = ground
-    inputs = ca.vertcat(u, ground)
+    inputs = ca.vertcat(u, ground, extra)
 
     def substitute_state(e: ca.SX) -> ca.SX:
         """Write an expression of the full state in the states of this state space."""
@@ -404,7 +395,7 @@ def build_state_space(model: Model, names: tuple[str, ...]) -> StateSpace:
     unit_force = ca.SX.eye(n_q)[:, list(forced_rows)]
     jacobians = [
         substitute_state(core_jacobian(full[core])),
-        substitute_state(core_jacobian(u)),
+        substitute_state(core_jacobian(ca.vertcat(u, extra))),
         substitute_state(core_jacobian(X)),
         substitute_state(
             ca.vertcat(
@@ -425,19 +416,8 @@ def build_state_space(model: Model, names: tuple[str, ...]) -> StateSpace:
     for c, std in zip(pose, POSE_STD, strict=False):
         if c in model.coordinates:
             initial_std[index.index(model.coordinates.index(c))] = std
-    error_scale = np.fmax(initial_std, 1.0)  # an effect's memory may be a torque, thousands of N m
-    input_slopes = ca.horzcat(jacobians[1], substitute_state(core_jacobian(full[last:])))
-    step = _rosenbrock_step(
-        state,
-        inputs,
-        X,
-        len(core),
-        substitute_state(rates[index]),
-        jacobians[0],
-        input_slopes,
-        jacobians[4],
-        error_scale,
-    )
+    rate_function = ca.Function("rates", [state, inputs, X], [substitute_state(rates[index])])
+    slope_function = ca.Function("core_slopes", [state, inputs, X], [jacobians[0]])
     readings = ca.Function(
         "readings",
         [state, inputs, X],
@@ -449,12 +429,14 @@ def build_state_space(model: Model, names: tuple[str, ...]) -> StateSpace:
             *([substitute_state(ca.jacobian(reading, X)[:, list(reading_parameters)])] if reading_parameters else []),
         ],
     )
+    seen = substitute_state(_features(model, q, nu))
     t = ca.SX.sym("t")
     channels = model.channels(t, X)
     mass = ca.Function("mass", [q, u, z, X], [ca.diag(M)])(0, 0, 0, model.nominal).full()[:, 0]
     return StateSpace(
         model,
         sensors,
+        added,
         len(core),
         np.array(index),
         full.numel(),
@@ -467,161 +449,71 @@ def build_state_space(model: Model, names: tuple[str, ...]) -> StateSpace:
         bool(ca.depends_on(reading, u)),
         BatchedFunction(jacobian_function, (2,)),
         BatchedFunction(readings, (2,)),
-        BatchedFunction(step, (3, 4)),
+        BatchedFunction(rate_function, (2,)),
+        BatchedFunction(slope_function, (2,)),
         BatchedFunction(ca.Function("pivots", [state, X], [substitute_state(ca.vec(factors[0]))]), (1,)),
         BatchedFunction(ca.Function("channels", [t, X], [*channels, *[ca.jacobian(e, X) for e in channels]]), (1,)),
+        BatchedFunction(ca.Function("features", [state], [seen, ca.jacobian(seen, state[: len(core)])])),
     )
 
 
-def _rosenbrock_step(
-    state: ca.SX,
-    u: ca.SX,
-    X: ca.SX,
-    core: int,
-    rates: ca.SX,
-    J: ca.SX,
-    B: ca.SX,
-    R: ca.SX,
-    error_scale: np.ndarray,
-) -> ca.Function:
-    """Build (state, u, du/dt, h, X) -> state after h and its error over error_scale (n,): the simulator's Rosenbrock
-    method.
+def feature_names(model: Model) -> tuple[tuple[str, int], ...]:
+    """Name what forces that the model lacks may depend on: "rate" of each driven joint; "gx", "gy", "turn" of contacts.
 
-    Angles that nothing depends on stand below the core's block in the Jacobian and need no solve.
+    With the index of the body. "turn" is the slip at the edge of a contact that its yaw rate makes.
     """
-    n = state.numel()
-    rate = ca.Function("rate", [state, u, X], [rates], {"cse": True})
-    y, left, slope, h = ca.SX.sym("y", n), ca.SX.sym("l", u.numel()), ca.SX.sym("s", u.numel()), ca.SX.sym("h")
-    Jy, By, Ry = ca.Function("jacobian", [state, u, X], [J, B, R], {"cse": True})(y, left, X)
-    lower, upper = lu(ca.SX.eye(core) / (GAMMA * h) - Jy)
-    dt = ca.vertcat(By @ slope, ca.SX.zeros(n - core, 1))
-    stages: list[ca.SX] = []
-    for time, gain, weights, c in zip(STAGE_TIMES, TIME_DERIVATIVE_WEIGHTS, A_ROWS, C_ROWS, strict=True):
-        at = y + sum((w * U for w, U in zip(weights, stages, strict=True)), ca.SX(n, 1))
-        right_hand_side = rate(at, left + slope * (time * h), X) + gain * h * dt
-        right_hand_side += sum((w * U for w, U in zip(c, stages, strict=True)), ca.SX(n, 1)) / h
-        inner = lu_solve(lower, upper, right_hand_side[:core, 0])
-        stages.append(ca.vertcat(inner, GAMMA * h * (Ry @ inner + right_hand_side[core:, 0])))
-    error = ca.norm_inf(stages[-1] / error_scale)
-    return ca.Function("step", [y, left, slope, h, X], [at + stages[-1], error], {"cse": True})
+    machine = model.machine
+    rates = [("rate", b.index) for b in machine.actuated]
+    return (*rates, *((kind, b.index) for b in machine.contacts for kind in ("gx", "gy", "turn")))
 
 
-def advance(space: StateSpace, s: np.ndarray, left: np.ndarray, right: np.ndarray, X: np.ndarray) -> np.ndarray:
-    """Integrate K states s (K, n) over one sample, with inputs linear from left to right (K, n_u + n_ground).
+def _features(model: Model, q: ca.SX, nu: ca.SX) -> ca.SX:
+    """Return the features (n_features,) of `feature_names`; zero where the machine has none of it."""
+    q = model.true_coordinates(q, model.nominal)
+    slips = model.kinematics(q, nu)[1]
+    places = model.edge_slips(q, nu)
+    found = {
+        ("rate", b.index): nu[model.coordinates.index(model.machine.coordinate(b))] for b in model.machine.actuated
+    }
+    for b in model.machine.contacts:
+        for kind in ("gx", "gy"):
+            name = f"{kind}{b.index}"
+            found[kind, b.index] = slips[model.slips.index(name)] if name in model.slips else ca.SX(0)
+        sides = [model.edges.index((b.index, side)) for side in ("left", "right") if (b.index, side) in model.edges]
+        found["turn", b.index] = (places[0, sides[1]] - places[0, sides[0]]) / 2 if len(sides) == 2 else ca.SX(0)
+    return ca.vertcat(*[found[n] for n in feature_names(model)], ca.SX(0, 1))
 
-    The result is not finite if an interval cannot be integrated, or if too many intervals need too many steps.
+
+SLOPES = ("slope_x", "slope_y")  # gravity along the root's axes, per unit of its weight [m/s2]
+
+
+def unknown_inputs(model: Model) -> tuple[tuple[int, str], ...]:
+    """Name the forces that act beside the torques: those of each contact, and gravity along the root's axes on a slope.
+
+    A name is a body and a kind of force; of a contact those that move the machine.
     """
-    sample = 1 / float(space.model.machine.sampling_hz)
-    with np.errstate(all="ignore"):
-        return _integrate(
-            space, s, left, (right - left) / sample, sample, X, MAX_SPLITS, MAX_MEAN_STEPS * max(len(s), BATCH_SIZE)
-        )[0]
-
-
-def _integrate(
-    space: StateSpace,
-    start: np.ndarray,
-    u: np.ndarray,
-    rate: np.ndarray,
-    h: float,
-    X: np.ndarray,
-    splits: int,
-    step_budget: int,
-) -> tuple[np.ndarray, int]:
-    """Make one step over h, and halve the intervals whose error is too large.
-
-    Returns the final states and what remains of step_budget. States are not finite once the budget is spent.
-    """
-    if len(start) > step_budget:
-        return np.full_like(start, np.nan), 0
-    step_budget -= len(start)
-    end, error = space.rosenbrock_step(start, u, rate, np.array([h]), X)
-    end = end[:, :, 0]
-    inaccurate = np.flatnonzero(~(error[:, 0, 0] < STEP_TOLERANCE))
-    if len(inaccurate) and splits:
-        middle, step_budget = _integrate(
-            space, start[inaccurate], u[inaccurate], rate[inaccurate], h / 2, X, splits - 1, step_budget
+    if not model.machine.contacts:
+        return ()
+    names, directions = model.force_directions
+    moves = (
+        np.abs(directions(np.linspace(0.1, 0.5, len(model.coordinates)), model.expand @ model.nominal).full()).max(
+            axis=0
         )
-        end[inaccurate], step_budget = _integrate(
-            space,
-            middle,
-            u[inaccurate] + rate[inaccurate] * (h / 2),
-            rate[inaccurate],
-            h / 2,
-            X,
-            splits - 1,
-            step_budget,
-        )
-    return end, step_budget
+        > 0
+    )
+    root = model.machine.body[0]
+    slopes = [(root.index, s) for s, c in zip(SLOPES, root.coordinates, strict=False) if c in model.coordinates]
+    return (*(n for n, there in zip(names, moves, strict=True) if there), *slopes)
 
 
-def differentiate(
-    space: StateSpace, s: np.ndarray, left: np.ndarray, right: np.ndarray, X: np.ndarray, force: bool = False
-) -> TransitionJacobians:
-    """Compute the derivatives of the K transitions between states s (K + 1, n), to about 1 %.
-
-    left, right (K, n_u + n_ground): inputs at the start and the end of the intervals. force: fill F as well. Slopes are
-    taken in the middle of an interval. Where a joint reverses, friction turns within a sample and affects everything
-    before it, so these intervals are divided into fine steps along the straight line between their ends.
-    """
-    h = 1 / float(space.model.machine.sampling_hz)
-    slopes = _radau_step(space, space.jacobians((s[:-1] + s[1:]) / 2, (left + right) / 2, X), h, force)
-    steps = _count_reversal_steps(space, s)
-    for fine in (REVERSAL_STEPS, ABRUPT_REVERSAL_STEPS):
-        turning = np.flatnonzero(steps == fine)
-        if len(turning) == 0:
-            continue
-        share = ((np.arange(fine) + 0.5) / fine)[:, None]
-        path = s[turning, None] + share * (s[turning + 1] - s[turning])[:, None]
-        inputs = left[turning, None] + share * (right[turning] - left[turning])[:, None]
-        local = space.jacobians(path.reshape(-1, space.n), inputs.reshape(-1, left.shape[1]), X)
-        fine_jacobians = _radau_step(space, local, h / fine, force)
-        A, B, BX, F = (
-            e.reshape(len(turning), fine, *e.shape[1:])
-            for e in (fine_jacobians.A, fine_jacobians.B, fine_jacobians.X, fine_jacobians.F)
-        )
-        for total_jacobian, parts in ((slopes.B, B), (slopes.X, BX), (slopes.F, F)):
-            total = parts[:, 0]
-            for k in range(1, fine):
-                total = A[:, k] @ total + parts[:, k]
-            total_jacobian[turning] = total
-        through = A[:, 0]
-        for k in range(1, fine):
-            through = A[:, k] @ through
-        slopes.A[turning] = through
-    return slopes
-
-
-def _count_reversal_steps(space: StateSpace, s: np.ndarray) -> np.ndarray:
-    """Number of fine steps (K,) for each interval between states s (K + 1, n); 0 if no friction turns in it."""
-    model = space.model
-    steps = np.zeros(len(s) - 1, int)
-    first = space.core - len(model.coordinates) - len(model.initial_memory_std)
-    for body in model.machine.body:
-        if body.friction is None or body.coordinates[0] not in model.coordinates:
-            continue
-        w = s[:, first + model.coordinates.index(body.coordinates[0])] / float(body.friction.smoothing)
-        nearest = np.where(w[:-1] * w[1:] <= 0, 0.0, np.minimum(np.abs(w[:-1]), np.abs(w[1:])))
-        change = np.abs(np.diff(w))
-        body_steps = np.where(
-            change > ABRUPT_CHANGE, ABRUPT_REVERSAL_STEPS, np.where(change > REVERSAL_CHANGE, REVERSAL_STEPS, 0)
-        )
-        steps = np.maximum(steps, np.where(nearest < REVERSAL_RANGE, body_steps, 0))
-    return steps
-
-
-def _radau_step(space: StateSpace, local: list[np.ndarray], h: float, force: bool) -> TransitionJacobians:
-    """Make one step of Radau IIA over each of K intervals of length h, with constant slopes."""
-    J, B, JX, JF, R = local
-    n, c, n_u, n_p = space.n, space.core, B.shape[2], JX.shape[2]
-    direct = h * np.concatenate([B, JX, JF] if force else [B, JX], axis=2)
-    eye, increment, J = np.eye(c), h * np.concatenate([J, R], axis=1), h * J
-    # The inverse gives the interval's mean response to the start and to the inputs, which leads to the end.
-    inverse = np.linalg.inv(eye - J * (2 / 3) + J @ J / 6)
-    A = np.zeros((len(J), n, n))
-    A[:, :, :c] = increment @ (inverse @ (eye - J / 6))
-    A[:, range(n), range(n)] += 1.0
-    through = increment @ (inverse @ (eye / 2 - J / 6))
-    through[:, range(c), range(c)] += 1.0
-    response = through @ direct
-    return TransitionJacobians(A, response[:, :, :n_u], response[:, :, n_u : n_u + n_p], response[:, :, n_u + n_p :])
+def _unknown_load(model: Model, q: ca.SX, M: ca.SX, X: ca.SX, added: tuple[tuple[int, str], ...]) -> ca.SX:
+    """Return the generalised forces (n_q, n_forces) of unit inputs of `unknown_inputs`; M (n_q, n_q): mass matrix."""
+    names, directions = model.force_directions
+    forces = directions(q, ca.sparsify(ca.DM(model.expand)) @ X)
+    columns = []
+    for name in added:
+        if name[1] in SLOPES:
+            columns.append(M[:, model.coordinates.index(model.machine.body[0].coordinates[SLOPES.index(name[1])])])
+        else:
+            columns.append(forces[:, names.index(name)])
+    return ca.horzcat(*columns)

@@ -7,7 +7,7 @@ samples right after a count are used. The noise of other sensors and of torques 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.integrate
@@ -15,7 +15,7 @@ import scipy.integrate
 from excite.errors import NotIdentifiableError
 from excite.logs import Log, integrate_pose, passes, remember, samples, white_noise
 from excite.model import Model
-from excite.model.machine import Filter, Sensor
+from excite.model.machine import Filter, Sensor, noise_of
 from excite.smoothing.linearisation import StateSpace
 from excite.text import format_number
 
@@ -81,13 +81,16 @@ class Trajectory:
     """States and errors that explain one log.
 
     state (N, n), torque_error (N - 1, n_u) [N m] of each interval, offset (m_o,) of the encoders [SI], ground_inputs
-    (N, n_ground): inputs from a map of the ground along the states.
+    (N, n_ground): inputs from a map of the ground along the states. lacking (K,): coefficients of the shapes of what
+    the model lacks. force_error (N - 1, n_forces): white forces [N, N m, m/s2] on the inputs `StateSpace.forces`.
     """
 
     state: np.ndarray
     torque_error: np.ndarray
     offset: np.ndarray
     ground_inputs: np.ndarray
+    lacking: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    force_error: np.ndarray | None = None
 
     @property
     def sampled_torque_error(self) -> np.ndarray:
@@ -133,7 +136,7 @@ def prepare_measurements(space: StateSpace, log: Log, unbiased: bool = False) ->
         used[:, j] = there
         if count_size is None:
             found = white_noise(log.readings(sensor.name))
-            sigma[j] = max(found, sensor.least_noise, 1e-9 + 1e-3 * float(sensor.noise or 0))
+            sigma[j] = max(found, sensor.least_noise, 1e-9 + 1e-3 * noise_of(model.machine, sensor))
             if sensor.kind == "ground_speed":  # near standstill noise has no sign, and the mean reading is above zero
                 used[:, j] &= value > LEAST_GROUND_SPEED * sigma[j]
             continue
@@ -155,7 +158,8 @@ def prepare_measurements(space: StateSpace, log: Log, unbiased: bool = False) ->
     rows_per_reading = [N / max(len(log.readings(s.name)), 1) for s in torques]
     torque_noise = np.array(
         [
-            np.sqrt(k) * max(log.noise.get(s.name) or white_noise(log.readings(s.name)), 1e-3 * float(s.noise or 1))
+            np.sqrt(k)
+            * max(log.noise.get(s.name) or white_noise(log.readings(s.name)), 1e-3 * (noise_of(model.machine, s) or 1))
             for k, s in zip(rows_per_reading, torques, strict=True)
         ]
     )
@@ -394,6 +398,7 @@ def describe_noise(space: StateSpace, measurements: Sequence[Measurements]) -> t
             levels.append((sensor, float(np.sqrt(np.mean([data.noise.sensor[j] ** 2 for data in measurements])))))
     texts = []
     for sensor, level in levels:
-        sheet = f"data sheet {format_number(float(sensor.noise), 3)}" if sensor.noise is not None else "no data sheet"
+        given = noise_of(model.machine, sensor)
+        sheet = f"data sheet {format_number(given, 3)}" if given else "no data sheet"
         texts.append(f"{sensor.name} {format_number(level, 3)} ({sheet})")
     return (f"noise per sample found in the log, SI: {', '.join(texts)}",)

@@ -99,7 +99,11 @@ class SmoothedChain:
 
         The random part e of a stage is C times the slope after it.
         """
-        states, slopes = self._states_for(np.concatenate([[1.0], p])[:, None])
+        return self.response(np.concatenate([[1.0], p]))
+
+    def response(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States and slopes (K - 1, n) for weights (c,) of the columns: the data, parameter steps, others."""
+        states, slopes = self._states_for(weights[:, None])
         return states[:, :, 0], slopes[:, :, 0]
 
     def slopes(self, of: slice) -> np.ndarray:

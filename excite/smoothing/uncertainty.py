@@ -12,7 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from excite.smoothing.gauss_newton import (
+from excite.smoothing.innovations import LinearisedLog
+from excite.smoothing.linearisation import StateSpace
+from excite.smoothing.log_fit import (
     Fit,
     NotConvergedError,
     apply_step,
@@ -21,8 +23,6 @@ from excite.smoothing.gauss_newton import (
     newton_step,
     parameter_indices,
 )
-from excite.smoothing.innovations import LinearisedLog
-from excite.smoothing.linearisation import StateSpace
 from excite.smoothing.measurements import Measurements, Trajectory, predict_readings
 
 PHASE_COUNT = 64  # starts of an encoder's count, between two edges, over which errors are averaged; chosen
@@ -50,14 +50,14 @@ def quantify_uncertainty(
     fit = fit if linear is None else replace(fit, linear=tuple(linear))  # so far it was linearised one step before
     n = len(fit.X)
     none_fixed = np.zeros(n, bool)
-    covariance, (step, *_), _, cost = newton_step(
-        space, measurements, fit.linear, fit.trajectories, fit.X, fit.prior, 0.0, none_fixed
+    covariance, (step, *_), cost = newton_step(
+        space, measurements, fit.linear, fit.trajectories, fit.X, fit.prior, none_fixed
     )
     at_bounds = at_bound(space, fit, covariance, step)
     conditional = covariance
     if at_bounds.any():
-        conditional, _, _, cost = newton_step(
-            space, measurements, fit.linear, fit.trajectories, fit.X, fit.prior, 0.0, at_bounds
+        conditional, _, cost = newton_step(
+            space, measurements, fit.linear, fit.trajectories, fit.X, fit.prior, at_bounds
         )
     excess = np.zeros_like(covariance)
     for data, trajectory, log, columns in zip(
@@ -204,9 +204,7 @@ def profile_widths(
         if linear is None:
             return 1.0, 1.0
         try:
-            conditional, steps, _, cost = newton_step(
-                space, measurements, linear, trajectories, X, fit.prior, 0.0, at_bounds
-            )
+            conditional, steps, cost = newton_step(space, measurements, linear, trajectories, X, fit.prior, at_bounds)
         except (NotConvergedError, np.linalg.LinAlgError):
             return 1.0, 1.0
         if not np.isfinite(cost):

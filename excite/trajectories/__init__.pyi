@@ -11,8 +11,10 @@ from .baselines import (
     compare as compare,
 )
 from .campaign import Campaign as Campaign, CampaignTrial as CampaignTrial, design_campaign as design_campaign
+from .clearance import has_shapes as has_shapes, pairs_left_out as pairs_left_out
 from .composite_objective import (
     COND_MAX as COND_MAX,
+    SIGMA_MAX as SIGMA_MAX,
     CompositeObjective as CompositeObjective,
     calibrate_surrogates as calibrate_surrogates,
     compose_objective as compose_objective,
@@ -55,7 +57,12 @@ from .limits import (
     simulate_on_lane as simulate_on_lane,
     stack_limits as stack_limits,
 )
-from .multistart import Design as Design, design as design, process_count as process_count
+from .multistart import (
+    BestSoFar as BestSoFar,
+    Design as Design,
+    design as design,
+    process_count as process_count,
+)
 from .objective import (
     OBJECTIVES as OBJECTIVES,
     cond_phi as cond_phi,
@@ -68,9 +75,17 @@ from .objective import (
     reported_value as reported_value,
 )
 from .prediction_contrasts import prediction_contrasts as prediction_contrasts
+from .rehearsal import (
+    JointCourse as JointCourse,
+    PlannedMotion as PlannedMotion,
+    Rehearsal as Rehearsal,
+    planned_motion as planned_motion,
+    rehearse as rehearse,
+)
 from .saved_design import (
     SavedDesign as SavedDesign,
     read_design as read_design,
+    read_design_model as read_design_model,
     read_design_summary as read_design_summary,
 )
 from .scoring import Score as Score, score as score, score_motion as score_motion

@@ -347,7 +347,9 @@ def bring_within_limits(model: Model, problem: Problem, target: Manoeuvre) -> Sc
     """Bring a drive inside every limit (see the module); else return the one with the least excess."""
     small = scale_into_limits(model, problem, target)
     found, motion = score_drive(model, problem, small)
-    state = SearchState(0, found.score, typical_sizes(model, problem, motion), found, found, motion, motion.t)
+    state = SearchState(
+        0, found.manoeuvre, found.score, typical_sizes(model, problem, motion), found, found, motion, motion.t
+    )
     margins: dict[str, float] = {}
     least = found
     for attempt in range(MAX_ATTEMPTS):

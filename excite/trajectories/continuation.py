@@ -118,7 +118,8 @@ class ScoredDrive:
 class SearchState:
     """Progress of one start.
 
-    state_sizes: typical sizes by state name. latest, best: drives found. motion: of `latest`.
+    begun_from: the drive before any stage. state_sizes: typical sizes by state name. latest, best: drives found.
+    motion: of `latest`.
     times (N,) [s], node_states (N, n_z): nodes of the last program, scaled; at first the samples of `motion` and None.
     start_pose (n_q,): start coordinates, once limits of the lane matter.
     travel_direction (N,): +-1 at the machine's samples, if reversals are limited.
@@ -128,6 +129,7 @@ class SearchState:
     """
 
     number: int
+    begun_from: Manoeuvre
     start_cond_phi: float
     state_sizes: Mapping[str, float]
     latest: ScoredDrive
@@ -172,6 +174,7 @@ def start_from_multisine(
     travel_direction = None if problem.reversals is None else travel_directions(motion, problem.reversals)
     return SearchState(
         number,
+        drive,
         objectives.cond_phi(model, motion),
         state_sizes,
         found,
@@ -197,6 +200,7 @@ def start_from_drive(
     score = objectives.cond_phi(model, motion)
     return SearchState(
         number,
+        drive,
         score,
         state_sizes,
         found,

@@ -2,8 +2,9 @@
 
 An arm under gravity falls under torques alone, so its design varies the motion, linear in the coefficients c:
 q_j(t) = path_j(t) + basis(t) c_j. The basis is a Fourier series or a spline; with `rest` every function of it ends at
-rest, and the path leads from the start pose to the end pose. Limits on position, speed, torque, torque rate and power
-are functions of the motion and its derivatives.
+rest, and the path leads from the start pose to the end pose. Joints without a given pose have a constant as a further
+function, so that the program chooses where they start. Limits on position, speed, acceleration, jerk, torque, torque
+rate, power, distances and the tool are functions of the motion and its derivatives.
 
 The program minimises the objective of the information matrix A = sum Phi' Phi over c by SLSQP. Gradients are exact:
 with G the gradient of the objective in A, dF = 2 <Phi G, dPhi>.
@@ -31,9 +32,18 @@ from excite.model import Model, build
 from excite.model.machine import Problem, Quantity
 from excite.simulation import Motion, inverse_dynamics, motion_along, play_back
 from excite.trajectories import composite_objective
+from excite.trajectories.clearance import random_poses
 from excite.trajectories.collocation import MappedFunction
 from excite.trajectories.composite_objective import CompositeObjective
-from excite.trajectories.limits import Limit, check_limits, machine_limits, stack_limits
+from excite.trajectories.limits import (
+    Limit,
+    check_limits,
+    chosen_poses,
+    machine_limits,
+    planned_limits,
+    stack_limits,
+    stack_planned,
+)
 
 HARMONICS = 5  # of a Fourier series; usual in the field
 SPLINE_DEGREE = 5  # torque rates are continuous; chosen
@@ -41,7 +51,8 @@ MAX_SPLINE_PIECES = 60  # of a free motion, which bounds the size of the program
 FRICTION_RATE = 0.08  # rad/s or m/s over which the program smooths dry friction; chosen
 OBJECTIVE_HZ = 25.0  # rate of the samples of the information in the program; chosen
 LIMITS_HZ = {"fourier": 20.0, "free": 40.0}  # rate of the samples at which the program keeps limits; chosen
-DENSE_PER_SAMPLE = 20  # points per sample at which limits of a result are judged; chosen
+DENSE_PER_SAMPLE = 20  # points per sample at which limits of a result are judged, at most; chosen
+DENSE_HZ = 2000.0  # rate of these points that suffices: a tenth of a knot's time is 20 ms
 FIRST_MARGIN = 2e-3  # share of a limit's range kept free in the program, for what happens between its samples; chosen
 REPAIR_FACTOR = 1.2  # further margin over the excess that it is for; chosen
 LEAST_REPAIR = 1e-3  # least further margin, share of half a limit's range; chosen
@@ -50,6 +61,8 @@ SOLVER_TOLERANCE = 1e-6  # of SLSQP, in the objective; chosen
 RESTART_GAIN = 1e-3  # gain of the objective that justifies another beginning; chosen
 SINGULAR_VALUE = 1e3  # objective where no parameter set is identifiable, above any other; chosen
 FOLLOWING = "following the motion"  # the limit that a motion exceeds whose simulation under a controller fails
+REACH_POSES = 5000  # random poses in which a distance is looked at before it becomes a limit of the program
+REACH_RESERVE = 0.5  # of the least distance, which all poses keep beyond it if it is left out; results are judged by it
 USUAL_AMPLITUDE = 1.0  # rad or m, amplitude of a guess for a joint without limits; chosen
 
 
@@ -58,7 +71,7 @@ class Basis:
     """Functions of time with derivatives, the same for every joint, and the path that they are added to.
 
     evaluate(t, order) -> (N, n_c): derivative of some order at times t (N,) [s]. start, end (n_q,): poses between which
-    the path leads, at rest at both ends; None for no path.
+    the path leads, at rest at both ends. chosen: joints whose pose is a coefficient, of a last function that is 1.
     """
 
     kind: str
@@ -68,6 +81,22 @@ class Basis:
     start: np.ndarray
     end: np.ndarray
     rest: bool
+    chosen: tuple[int, ...] = ()
+
+    @property
+    def free(self) -> np.ndarray:
+        """Coefficients (n_q, n_c) that may differ from zero."""
+        free = np.ones((len(self.start), self.count), bool)
+        if self.chosen:
+            free[:, -1] = np.isin(np.arange(len(self.start)), self.chosen)
+        return free
+
+    def shrunk(self, coefficients: np.ndarray, share: float) -> np.ndarray:
+        """Return coefficients (n_q, n_c) of a smaller motion about the same poses."""
+        moving = slice(0, self.count - bool(self.chosen))
+        found = np.array(coefficients)
+        found[:, moving] *= share
+        return found
 
     def path(self, t: np.ndarray, order: int) -> np.ndarray:
         """Return the path (N, n_q), a polynomial of fifth order with zero speed and acceleration at both ends."""
@@ -76,6 +105,19 @@ class Basis:
         rise = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
         shape = rise.deriv(order)(t / self.duration) / self.duration**order if order else rise(t / self.duration)
         return self.start * (order == 0) + np.outer(shape, self.end - self.start)
+
+
+def motion_basis(model: Model, problem: Problem, kind: str, start: np.ndarray, end: np.ndarray) -> Basis:
+    """Return the basis of a kind in BASES, with a constant if the poses at rest of some joints are to be chosen."""
+    basis = BASES[kind](problem, start, end)
+    chosen = chosen_poses(model, problem) if problem.rest else ()
+    if not chosen:
+        return basis
+
+    def evaluate(t: np.ndarray, order: int) -> np.ndarray:
+        return np.hstack([basis.evaluate(t, order), np.full((len(t), 1), float(order == 0))])
+
+    return replace(basis, count=basis.count + 1, evaluate=evaluate, chosen=chosen)
 
 
 def fourier_basis(problem: Problem, start: np.ndarray, end: np.ndarray) -> Basis:
@@ -108,10 +150,12 @@ def fourier_basis(problem: Problem, start: np.ndarray, end: np.ndarray) -> Basis
 def spline_basis(problem: Problem, start: np.ndarray, end: np.ndarray) -> Basis:
     """Return B-splines with knots `knot_s` apart, further in a long drive (MAX_SPLINE_PIECES pieces at most).
 
-    With `rest`, those that are at rest at both ends.
+    With `rest`, those that are at rest at both ends; of a periodic drive, those that go on from its end at its start.
     """
     T, rest = float(problem.duration_s), problem.rest
     pieces = min(MAX_SPLINE_PIECES, max(8, round(T / float(problem.knot_s))))
+    if problem.periodic:
+        return _periodic_spline(T, pieces, start, end)
     knots = np.concatenate([np.zeros(SPLINE_DEGREE), np.linspace(0, T, pieces + 1), np.full(SPLINE_DEGREE, T)])
     count = len(knots) - SPLINE_DEGREE - 1
     kept = slice(3, count - 3) if rest else slice(0, count)
@@ -122,6 +166,19 @@ def spline_basis(problem: Problem, start: np.ndarray, end: np.ndarray) -> Basis:
         return np.asarray(by_order[order](np.clip(t, 0, T)))
 
     return Basis("free", T, len(np.arange(count)[kept]), evaluate, start, end, rest)
+
+
+def _periodic_spline(T: float, pieces: int, start: np.ndarray, end: np.ndarray) -> Basis:
+    """Return B-splines of period T [s]."""
+    knots = np.arange(-SPLINE_DEGREE, pieces + SPLINE_DEGREE + 1) * (T / pieces)
+    wrapped = np.eye(pieces)[np.arange(pieces + SPLINE_DEGREE) % pieces]
+    spline = BSpline(knots, wrapped, SPLINE_DEGREE)
+    by_order = [spline, *(spline.derivative(k) for k in range(1, 4))]
+
+    def evaluate(t: np.ndarray, order: int) -> np.ndarray:
+        return np.asarray(by_order[order](np.clip(t, 0, T)))
+
+    return Basis("free", T, pieces, evaluate, start, end, False)
 
 
 BASES: dict[str, Callable[[Problem, np.ndarray, np.ndarray], Basis]] = {"fourier": fourier_basis, "free": spline_basis}
@@ -146,25 +203,29 @@ class JointMotion:
 
 
 def between_samples(model: Model, problem: Problem, motion: JointMotion) -> dict[str, float]:
-    """Return the largest excess over every limit at DENSE_PER_SAMPLE points per sample, as a fraction of its range.
+    """Return the largest excess over every limit between samples, as a fraction of its range.
+
+    It is judged DENSE_PER_SAMPLE times per sample, or at DENSE_HZ if that is less.
 
     Torque rates are those over one sample's time, from any of these points on: a drive delivers torques that are linear
     between samples.
     """
     rate = float(model.machine.sampling_hz)
-    count = round(motion.basis.duration * rate) * DENSE_PER_SAMPLE + 1
+    points = min(DENSE_PER_SAMPLE, max(2, round(DENSE_HZ / rate)))
+    count = round(motion.basis.duration * rate) * points + 1
     t = np.linspace(0, motion.basis.duration, count)
     q, nu, a = (motion.at(t, k) for k in range(3))
     u = motion_along(model, t, q, nu, a).u
-    du = (u[DENSE_PER_SAMPLE:] - u[:-DENSE_PER_SAMPLE]) * rate
-    du = np.vstack([du, np.tile(du[-1:], (DENSE_PER_SAMPLE, 1))])
-    limits = machine_limits(model, problem)
-    if not limits:
-        return {}
-    values = stack_limits(model, limits)(q.T, nu.T, u.T, du.T).full()
+    du = (u[points:] - u[:-points]) * rate
+    du = np.vstack([du, np.tile(du[-1:], (points, 1))])
+    limits, planned = machine_limits(model, problem), planned_limits(model)
+    values = [
+        *(stack_limits(model, limits)(q.T, nu.T, u.T, du.T).full() if limits else ()),
+        *(stack_planned(model, planned)(a.T, motion.at(t, 3).T).full() if planned else ()),
+    ]
     return {
         g.name: max(0.0, float(v.max() - g.high), float(g.low - v.min())) / g.range
-        for g, v in zip(limits, values, strict=True)
+        for g, v in zip((*limits, *planned), values, strict=True)
     }
 
 
@@ -172,7 +233,7 @@ def all_violations(model: Model, problem: Problem, motion: JointMotion) -> dict[
     """Return the largest excess over every limit, at the samples and between them, as a fraction of its range."""
     found = check_limits(model, problem, motion.sample(model))
     between = between_samples(model, problem, motion)
-    return {name: max(x, between.get(name, 0.0)) for name, x in found.items()}
+    return {name: max(found.get(name, 0.0), between.get(name, 0.0)) for name in found | between}
 
 
 def violations_as_followed(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
@@ -204,7 +265,7 @@ def with_smooth_friction(model: Model, least: float = FRICTION_RATE) -> Model:
 
 
 class MotionProgram:
-    """The program of a joint motion in x (n_q n_c,), its coefficients: an objective and limits scaled to -1 ... 1.
+    """The program of a joint motion in x (n_x,), its free coefficients: an objective and limits scaled to -1 ... 1.
 
     sharpness: of the objective's maximum. margins (n_g,): share of each limit's half range that is kept free.
     """
@@ -212,8 +273,14 @@ class MotionProgram:
     def __init__(self, model: Model, problem: Problem, objective: CompositeObjective, basis: Basis) -> None:
         self.basis, self.objective = basis, objective
         self.sharpness = 10.0
+        self._valued: tuple[np.ndarray, float, float] | None = None
+        self._limited: tuple[np.ndarray, np.ndarray] | None = None
         self.n_q, self.n_c, self.n_b = len(model.coordinates), basis.count, len(model.base.names)
-        self.limits = machine_limits(model, problem)
+        self._free = basis.free
+        self._columns = self._free.ravel()
+        machine = reachable_limits(model, machine_limits(model, problem))
+        planned = planned_limits(model)
+        self.limits = (*machine, *planned)
         self.n_g = len(self.limits)
         self.margins = np.full(self.n_g, FIRST_MARGIN)
         rate, T = float(model.machine.sampling_hz), basis.duration
@@ -223,14 +290,14 @@ class MotionProgram:
         self._path, self._B = self._tables(np.linspace(0, T, n_w), 3)
         self._limit_path, self._limit_B = self._tables(np.linspace(0, T, round(T * LIMITS_HZ[basis.kind]) + 1), 4)
         self._bounded = np.array([np.isfinite(g.low) for g in self.limits], bool)
-        self._functions(model)
+        self._functions(model, machine, planned)
 
     def _tables(self, t: np.ndarray, orders: int) -> tuple[np.ndarray, np.ndarray]:
         """Return path (N, orders, n_q) and basis (N, orders, n_c) with their derivatives."""
         path = np.stack([self.basis.path(t, k) for k in range(orders)], axis=1)
         return path, np.stack([self.basis.evaluate(t, k) for k in range(orders)], axis=1)
 
-    def _functions(self, model: Model) -> None:
+    def _functions(self, model: Model, machine: tuple[Limit, ...], planned: tuple[Limit, ...]) -> None:
         """Build the regressor, the limits and their derivatives over all samples."""
         n_q = self.n_q
         q, nu, a = model.symbols()
@@ -244,18 +311,29 @@ class MotionProgram:
         u = inverse_dynamics(model)(q, nu, a, model.nominal)
         du = ca.jtimes(u, z, ca.vertcat(nu, a, jerk))
         centre, half = np.array([_centre(g) for g in self.limits]), np.array([_half(g) for g in self.limits])
-        values = (stack_limits(model, self.limits)(q, nu, u, du) - centre) / half if self.n_g else ca.SX(0, 1)
+        stacked = ca.vertcat(stack_limits(model, machine)(q, nu, u, du), stack_planned(model, planned)(a, jerk))
+        values = (stacked - centre) / half
         slope = ca.jacobian(values, y)
         pattern = np.array(ca.DM(slope.sparsity(), 1).full(), bool).reshape(self.n_g, 4, n_q)
         self._depends: np.ndarray = np.asarray(pattern.any(axis=1))
         N = len(self._limit_path)
         self._g = _mapped([y], values, N, (self.n_g,))
-        self._g_jacobian = _mapped([y], slope, N, (4 * n_q, self.n_g))
+        self._g_jacobian = _mapped([y], slope, max(1, 2 * self.n_g), (4 * n_q, self.n_g))
 
     @property
     def size(self) -> int:
-        """Number of coefficients."""
-        return self.n_q * self.n_c
+        """Number of free coefficients."""
+        return int(self._columns.sum())
+
+    def coefficients(self, x: np.ndarray) -> np.ndarray:
+        """Return all coefficients (n_q, n_c) of the free ones x (n_x,)."""
+        found = np.zeros((self.n_q, self.n_c))
+        found[self._free] = x
+        return found
+
+    def unknowns(self, coefficients: np.ndarray) -> np.ndarray:
+        """Return the free ones x (n_x,) of all coefficients (n_q, n_c)."""
+        return np.asarray(coefficients[self._free])
 
     @property
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
@@ -269,7 +347,7 @@ class MotionProgram:
 
     def _states(self, x: np.ndarray, path: np.ndarray, B: np.ndarray) -> np.ndarray:
         """Return q and its derivatives (N, orders n_q) at all samples."""
-        return np.asarray((path + B @ x.reshape(self.n_q, self.n_c).T).reshape(len(path), -1))
+        return np.asarray((path + B @ self.coefficients(x).T).reshape(len(path), -1))
 
     # ------------------------------------------------------------------------------------------ objective
 
@@ -288,6 +366,8 @@ class MotionProgram:
 
     def value(self, x: np.ndarray) -> float:
         """Return the objective, SINGULAR_VALUE if the information is singular."""
+        if self._valued is not None and self.sharpness == self._valued[1] and np.array_equal(x, self._valued[0]):
+            return self._valued[2]
         found = composite_objective.score_matrices(self.objective, self.matrices(x), self.sharpness)
         return found if np.isfinite(found) else SINGULAR_VALUE
 
@@ -302,14 +382,18 @@ class MotionProgram:
         C = np.zeros_like(W)
         for w, g in zip(self.objective.row_weights, G, strict=True):
             C += 2 * w[:, None] ** 2 * (W.reshape(-1, self.n_b) @ g).reshape(W.shape)
+        self._valued = np.array(x), self.sharpness, value
         (slope,) = self._W_slope(z, (C * self._column_scale).transpose(0, 2, 1))
-        return value, np.asarray((slope.reshape(-1, self.n_q).T @ self._B.reshape(-1, self.n_c)).ravel())
+        gradient = slope.reshape(-1, self.n_q).T @ self._B.reshape(-1, self.n_c)
+        return value, self.unknowns(gradient)
 
     # ------------------------------------------------------------------------------------------ limits
 
     def limit_values(self, x: np.ndarray) -> np.ndarray:
         """Return the limits (N, n_g), scaled to -1 ... 1, at all their samples."""
-        return np.asarray(self._g(self._states(x, self._limit_path, self._limit_B))[0])
+        if self._limited is None or not np.array_equal(x, self._limited[0]):
+            self._limited = np.array(x), self._g(self._states(x, self._limit_path, self._limit_B))[0]
+        return self._limited[1]
 
     def slack(self, x: np.ndarray) -> np.ndarray:
         """Return what is left of every limit (2 n_g,) at its highest and lowest sample, negative where exceeded."""
@@ -319,25 +403,33 @@ class MotionProgram:
 
     def slack_jacobian(self, x: np.ndarray) -> np.ndarray:
         """Return the derivative (2 n_g, n_x) of `slack`, at the samples that are highest and lowest."""
-        y = self._states(x, self._limit_path, self._limit_B)
-        g = self._g(y)[0]
-        (J,) = self._g_jacobian(y)
+        g = self.limit_values(x)
         sample = np.concatenate([g.argmax(axis=0), g.argmin(axis=0)])
         limit = np.tile(np.arange(self.n_g), 2)
-        local = J[sample, :, limit].reshape(-1, 4, self.n_q)
-        full = np.matmul(local.transpose(0, 2, 1), self._limit_B[sample]).reshape(-1, self.size)
+        y = self._states(x, self._limit_path[sample], self._limit_B[sample])
+        (J,) = self._g_jacobian(y)
+        local = J[np.arange(2 * self.n_g), :, limit].reshape(-1, 4, self.n_q)
+        full = np.matmul(local.transpose(0, 2, 1), self._limit_B[sample]).reshape(-1, self.n_q * self.n_c)
+        full = full[:, self._columns]
         sign = np.concatenate([-np.ones(self.n_g), np.where(self._bounded, 1.0, 0.0)])
         return np.asarray(sign[:, None] * full)
 
-    def reach(self, x: np.ndarray) -> np.ndarray:
-        """Return the share (n_q,) of its limits on position and speed that each joint uses; amplitude without them."""
-        used = np.abs(self.limit_values(x)).max(axis=0, initial=0.0)
-        found = np.zeros(self.n_q)
+    def room(self, x: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """Return the factor (n_q,) by which each joint's motion about a pose may grow, by position and speed.
+
+        x, pose (n_x,): the motion, and the pose alone. Without such limits a joint's amplitude is USUAL_AMPLITUDE.
+        """
+        base = self.limit_values(pose)
+        moved = np.abs(self.limit_values(x) - base).max(axis=0)
+        left = np.maximum(1 - np.abs(base).max(axis=0), 0.0)
+        found = np.full(self.n_q, np.inf)
         for k, g in enumerate(self.limits):
             if g.kind in ("position", "rate"):
-                found[self._depends[k]] = np.maximum(found[self._depends[k]], used[k])
-        q = self._states(x, self._path, self._B)[:, : self.n_q]
-        return np.where(found > 0, found, np.abs(q).max(axis=0) / USUAL_AMPLITUDE)
+                on = self._depends[k]
+                found[on] = np.minimum(found[on], left[k] / max(moved[k], 1e-9))
+        q = self._states(x, self._limit_path, self._limit_B) - self._states(pose, self._limit_path, self._limit_B)
+        usual = USUAL_AMPLITUDE / np.maximum(np.abs(q[:, : self.n_q]).max(axis=0), 1e-9)
+        return np.where(np.isfinite(found), found, usual)
 
     def widen_margins(self, violations: Mapping[str, float]) -> None:
         """Add to the margins of limits that a motion exceeds; violations as fractions of their ranges."""
@@ -391,6 +483,19 @@ class MotionProgram:
     def tolerated(self) -> np.ndarray:
         """Excess (2 n_g,) over the margins that still keeps the limits at their samples."""
         return np.tile(self.margins, 2)
+
+
+def reachable_limits(model: Model, limits: tuple[Limit, ...]) -> tuple[Limit, ...]:
+    """Return the limits that a motion can come near: all but those on distances that no random pose comes near."""
+    clear = [g for g in limits if g.kind == "clearance"]
+    if not clear:
+        return limits
+    n_q, n_u = len(model.coordinates), len(model.inputs)
+    poses = random_poses(model, REACH_POSES).T
+    still = np.zeros((n_u, poses.shape[1]))
+    nearest = stack_limits(model, clear)(poses, np.zeros((n_q, poses.shape[1])), still, still).full().max(axis=1)
+    far = {g.name for g, x in zip(clear, nearest, strict=True) if x < g.high - REACH_RESERVE}
+    return tuple(g for g in limits if g.name not in far)
 
 
 class _StopSearch(Exception):

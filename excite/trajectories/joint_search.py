@@ -20,38 +20,43 @@ import numpy as np
 from excite.errors import MachineError
 from excite.model import Model
 from excite.model.machine import Problem
+from excite.simulation import motion_along
 from excite.trajectories import composite_objective, objective as objectives
+from excite.trajectories.clearance import drive_ranges, random_poses
 from excite.trajectories.composite_objective import SIGMA_MAX, CompositeObjective
 from excite.trajectories.excitation import Manoeuvre
 from excite.trajectories.joint_motion import (
-    BASES,
     JointMotion,
     MotionProgram,
     all_violations,
+    motion_basis,
     violations_as_followed,
     with_smooth_friction,
 )
-from excite.trajectories.limits import TOLERANCE, end_poses
+from excite.trajectories.limits import TOLERANCE, chosen_poses, end_poses, machine_limits, stack_limits
 from excite.trajectories.multistart import (
     Design,
     Report,
     begin_worker,
     ignore_killed_workers,
     infeasible_error,
+    no_drive_yet,
     process_count,
     progress_reports,
     stop_file,
     write_stage,
 )
 
-GUESSES = 200  # random series of which the best is a start; chosen
+GUESSES = 100  # random series of which the best is a start; chosen
 GUESS_REACH = 0.9  # share of the limits on position and speed that a guess may use; chosen
-SHRINK, SHRINKS = 0.85, 12  # factor of a guess outside of its limits, and how often it is applied; chosen
+START_POSES = 1000  # random poses of which those that keep every limit may be the start
+START_REACH = 0.7  # share of a joint's range that they are drawn from: a start at its end leaves no room
+SHRINK, SHRINKS = 0.7, 6  # factor of a guess outside of its limits, and how often it is applied; chosen
 DRAWN_BACK = (0.995, 0.98, 0.95, 0.9, 0.8)  # factors of coefficients that keep limits in the end; chosen
 DRAWN_BACK_FOLLOWED = (0.998, 0.995, 0.99, 0.98, 0.95)  # those that keep limits as followed; chosen
 REPAIR_ITERATIONS = 60  # of a solve with larger margins; chosen
 ROUNDING = 1e-6  # excess that counts as none, share of a limit's range; chosen
-REPAIRS = 4  # solves with larger margins; chosen
+REPAIRS = 3  # solves with larger margins; chosen
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,7 @@ class Stage:
 
 FIRST_STAGE = Stage("fourier", 30, 200)
 TRAJECTORIES: dict[str, tuple[Stage, ...]] = {  # stages by the kind of motion; iterations chosen for a minute
-    "free": (FIRST_STAGE, Stage("free", 30, 150), Stage("free", 100, 500)),
+    "free": (FIRST_STAGE, Stage("free", 30, 150), Stage("free", 100, 250)),
     "fourier": (FIRST_STAGE, Stage("fourier", 100, 300), Stage("fourier", 300, 300)),
 }
 
@@ -145,12 +150,13 @@ def design_joint_motion(
     composite = composite_objective.compose_objective(model, objective) if isinstance(objective, str) else objective
     if starts < 1:
         raise ValueError(f"starts must be at least 1, got {starts}")
+    free_poses(model, problem)
     deadline = None if budget_s is None else time.time() + budget_s
     seeds = np.random.SeedSequence(seed).generate_state(starts)
     states: dict[int, MotionState] = {}
     with (
         stop_file() as stop,
-        progress_reports(stop.parent, progress, starts * len(TRAJECTORIES[trajectory])),
+        progress_reports(stop.parent, progress, starts * len(TRAJECTORIES[trajectory]), starts),
         joblib.parallel_config("loky", inner_max_num_threads=1),
     ):
         run = joblib.Parallel(n_jobs=process_count(), return_as="generator_unordered")
@@ -168,8 +174,8 @@ def design_joint_motion(
     complete = len(states) == starts and all(t.complete for t in states.values())
     if best.best.excess > TOLERANCE:
         if interrupted:
-            raise KeyboardInterrupt
-        raise infeasible_error(composite, best.best.violations, complete)
+            raise KeyboardInterrupt(no_drive_yet(best.best.violations))
+        raise infeasible_error(model, composite, best.best.violations, complete)
     chosen = keep_as_followed(model, problem, composite, best.best)
     states[best.number] = replace(best, best=chosen)
     motion = _as_motion(model, problem, chosen.basis, chosen.coefficients).sample(model)
@@ -197,7 +203,7 @@ def _reported(objective: CompositeObjective, found: ScoredMotion) -> float:
 
 
 def _as_motion(model: Model, problem: Problem, basis: str, coefficients: np.ndarray) -> JointMotion:
-    return JointMotion(BASES[basis](problem, *end_poses(model, problem)), coefficients)
+    return JointMotion(motion_basis(model, problem, basis, *end_poses(model, problem)), coefficients)
 
 
 def score_joint_motion(
@@ -231,7 +237,7 @@ def _run_start(
     state = None
     for k, found in enumerate(search(model, problem, objective, trajectory, seed, should_stop)):
         state = replace(found, number=number)
-        write_stage(stop, number, k, _reported(objective, state.best))
+        write_stage(stop, number, k, _reported(objective, state.best), state.best.violations)
     return state
 
 
@@ -247,23 +253,23 @@ def search(
     smooth = with_smooth_friction(model)
     poses = end_poses(model, problem)
     stages = TRAJECTORIES[trajectory]
-    program = MotionProgram(smooth, problem, objective, BASES[stages[0].basis](problem, *poses))
-    x = best_guess(program, seed, should_stop)
-    best = score_joint_motion(model, problem, objective, stages[0].basis, _shaped(program, x))
+    program = MotionProgram(smooth, problem, objective, motion_basis(model, problem, stages[0].basis, *poses))
+    x = best_guess(program, free_poses(model, problem), seed, should_stop)
+    best = score_joint_motion(model, problem, objective, stages[0].basis, program.coefficients(x))
     guess = _as_motion(model, problem, stages[0].basis, best.coefficients).sample(model)
     first = objectives.cond_phi(model, guess)
     iterations = 0
     for stage in stages:
         if program.basis.kind != stage.basis:
             before = program
-            program = MotionProgram(smooth, problem, objective, BASES[stage.basis](problem, *poses))
+            program = MotionProgram(smooth, problem, objective, motion_basis(model, problem, stage.basis, *poses))
             x = _carried_over(before, program, x)
         program.sharpness = stage.sharpness
         for repair in range(1 + (REPAIRS if stage is stages[-1] else 1)):
             found = program.solve(x, should_stop, REPAIR_ITERATIONS if repair else stage.iterations)
             iterations += found.iterations
             x = found.x
-            scored = score_joint_motion(model, problem, objective, stage.basis, _shaped(program, x))
+            scored = score_joint_motion(model, problem, objective, stage.basis, program.coefficients(x))
             best = min(best, scored, _drawn_back(model, problem, objective, scored), key=lambda s: s.rank)
             if scored.excess <= ROUNDING or should_stop():
                 break
@@ -275,8 +281,9 @@ def search(
 
 def _drawn_back(model: Model, problem: Problem, objective: CompositeObjective, found: ScoredMotion) -> ScoredMotion:
     """Return a motion that exceeds a limit with its coefficients reduced until it keeps all of them, or as it is."""
+    basis = _as_motion(model, problem, found.basis, found.coefficients).basis
     for share in DRAWN_BACK if found.excess > ROUNDING else ():
-        less = score_joint_motion(model, problem, objective, found.basis, share * found.coefficients)
+        less = score_joint_motion(model, problem, objective, found.basis, basis.shrunk(found.coefficients, share))
         if less.excess <= ROUNDING:
             return less
     return found
@@ -290,8 +297,9 @@ def keep_as_followed(
     A motion that exceeds limits as planned, or that no reduction helps, stays as it is.
     """
     first = _with_followed(model, problem, found)
+    basis = _as_motion(model, problem, found.basis, found.coefficients).basis
     for share in DRAWN_BACK_FOLLOWED if first.excess <= ROUNDING < first.followed_excess else ():
-        less = score_joint_motion(model, problem, objective, first.basis, share * first.coefficients)
+        less = score_joint_motion(model, problem, objective, first.basis, basis.shrunk(first.coefficients, share))
         less = _with_followed(model, problem, less)
         if max(less.excess, less.followed_excess) <= ROUNDING:
             return less
@@ -303,38 +311,82 @@ def _with_followed(model: Model, problem: Problem, found: ScoredMotion) -> Score
     return replace(found, followed=violations_as_followed(model, problem, motion))
 
 
-def _shaped(program: MotionProgram, x: np.ndarray) -> np.ndarray:
-    return x.reshape(program.n_q, program.n_c)
-
-
 def _carried_over(before: MotionProgram, program: MotionProgram, x: np.ndarray) -> np.ndarray:
     """Return the coefficients of the program's basis that follow those of another one best."""
     t = np.linspace(0, program.basis.duration, 8 * program.n_c)
-    target = JointMotion(before.basis, _shaped(before, x)).at(t) - program.basis.path(t, 0)
-    return np.asarray(np.linalg.lstsq(program.basis.evaluate(t, 0), target, rcond=None)[0].T.ravel())
+    found = before.coefficients(x)
+    target = JointMotion(before.basis, found).at(t) - program.basis.path(t, 0)
+    moving = program.n_c - bool(program.basis.chosen)
+    carried = np.zeros((program.n_q, program.n_c))
+    if program.basis.chosen:
+        carried[:, -1] = found[:, -1]
+        target = target - found[:, -1]
+    carried[:, :moving] = np.linalg.lstsq(program.basis.evaluate(t, 0)[:, :moving], target, rcond=None)[0].T
+    return program.unknowns(carried)
 
 
-def best_guess(program: MotionProgram, seed: int, should_stop: Callable[[], bool]) -> np.ndarray:
+def best_guess(program: MotionProgram, poses: np.ndarray, seed: int, should_stop: Callable[[], bool]) -> np.ndarray:
     """Return the best of GUESSES random motions (n_x,), scaled into the limits where that can be done.
 
-    Each joint is scaled into its limits on position and speed, then all together.
+    poses (k, n_q): where they may start. Each joint is scaled into its limits on position and speed, then all together.
     """
     rng = np.random.default_rng(seed)
+    basis = program.basis
     best, chosen = (True, float("inf")), None
     for _ in range(GUESSES):
-        x = rng.normal(size=(program.n_q, program.n_c)) * rng.uniform(0.3, 1.0, (program.n_q, 1))
-        used = program.reach(x.ravel())
-        x *= np.where(used > GUESS_REACH, GUESS_REACH / np.maximum(used, 1e-9), 1.0)[:, None]
+        guess = rng.normal(size=(program.n_q, program.n_c)) * rng.uniform(0.3, 1.0, (program.n_q, 1))
+        pose = np.zeros_like(guess)
+        if basis.chosen:
+            pose[:, -1] = poses[rng.integers(len(poses))] - basis.start
+            guess[:, -1] = pose[:, -1]
+        room = GUESS_REACH * program.room(program.unknowns(guess), program.unknowns(pose))
+        moving = guess - pose
+        guess = pose + moving * np.minimum(room, 1.0)[:, None]
         for _ in range(SHRINKS):
-            over = bool((program.slack(x.ravel()) < 0).any())
+            over = bool((program.slack(program.unknowns(guess)) < 0).any())
             if not over:
                 break
-            x *= SHRINK
-        value = program.value(x.ravel())
-        found = over, value if np.isfinite(value) else float("inf")
-        if chosen is None or found < best:
-            best, chosen = found, x.ravel()
+            guess = basis.shrunk(guess, SHRINK)
+        if chosen is None or not over:
+            x = program.unknowns(guess)
+            value = program.value(x)
+            found = over, value if np.isfinite(value) else float("inf")
+            if chosen is None or found < best:
+                best, chosen = found, x
         if should_stop():
             break
     assert chosen is not None
     return np.asarray(chosen)
+
+
+def free_poses(model: Model, problem: Problem) -> np.ndarray:
+    """Return poses (k, n_q) that keep every limit at rest, the given ones as they are; half of each range is tried.
+
+    Raises MachineError if none does.
+    """
+    start, end = end_poses(model, problem)
+    chosen = list(chosen_poses(model, problem)) if problem.rest else []
+    low, high = drive_ranges(model)
+    drawn = (low + high) / 2 + (random_poses(model, START_POSES) - (low + high) / 2) * START_REACH
+    tried = np.tile(start, (len(drawn) if chosen else 1, 1))
+    tried[:, chosen] = drawn[: len(tried), chosen]
+    every = np.vstack([tried, end[None, :]]) if not chosen else tried
+    limits = machine_limits(model, problem)
+    still = np.zeros_like(every)
+    u = motion_along(model, np.arange(float(len(every))), every, still, still).u
+    values = stack_limits(model, limits)(every.T, still.T, u.T, 0 * u.T).full().reshape(len(limits), -1)
+    low_g, high_g = (np.array([getattr(g, key) for g in limits])[:, None] for key in ("low", "high"))
+    over = (values > high_g) | (values < low_g)
+    kept = ~over.any(axis=0)
+    if (kept.all() if not chosen else kept.any()) or not limits:
+        return tried[kept[: len(tried)]]
+    often = limits[int(np.argmax(over.mean(axis=1)))]
+    where = (
+        f"none of {len(tried)} random start poses keeps every limit"
+        if chosen
+        else "the start or end pose exceeds a limit"
+    )
+    raise MachineError(
+        f"{model.machine.name}: {where} at rest, first of all {often.name}: give the problem another"
+        " start_pose, or change shapes, floor or limits in the machine file"
+    )

@@ -16,6 +16,8 @@ import scipy
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion, simulate
+from excite.text import format_number
+from excite.trajectories.clearance import clearance_limits, drive_ranges, tool_point
 
 REST_SPEED = 0.02  # m/s, speed that counts as rest at the ends; problem R60
 REST_RATE = 0.01  # rad/s, the same for rates of rotation; problem R60
@@ -29,6 +31,7 @@ TOP_SPEED_FACTOR = 1.2  # top speed over rim speed, with slip; chosen
 DEFAULT_TOP_SPEED = 10.0  # m/s, without a limit on rim speed; chosen
 SLIP_ROUNDING = 0.05  # of the slip limit: what it shows without slip, as a share of the limit; chosen
 POWER_SMOOTHING = 1e-3  # of the power limit: rounding of |u q'|; chosen
+TOOL_ROUNDING = 0.05  # of the limit on the tool's speed: what it shows at rest, as a share of the limit
 
 
 @dataclass(frozen=True)
@@ -96,9 +99,9 @@ def _torque_rate(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[B
 def _position(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
     """A joint's angle or stroke, `position` of a joint, or `position_low` and `position_high`."""
     for body in model.machine.body:
-        if body.limit.position_range is not None and model.machine.is_free(body):
-            low, high = body.limit.position_range
-            angle = model.machine.joint_values(body, s.q)
+        if body.limit.drive_range is not None and model.machine.is_free(body):
+            low, high = body.limit.drive_range
+            angle = model.machine.joint_positions(body, s.q)
             yield f"position {body.where}", angle, low, high, "rad" if body.joint == "revolute" else "m"
 
 
@@ -184,6 +187,30 @@ def _travel(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[Bounde
         yield TRAVEL_LIMIT, s.nu[0], -high, high, "m/s"
 
 
+def _clearance(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
+    """Distances of an arm's links from each other, the floor and what stands around, `shape` of bodies and `world`."""
+    if model.follows_positions:
+        yield from clearance_limits(model, s.q)
+
+
+def _tool(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
+    """Place and speed of the tool's point, `tool` of the machine.
+
+    |v| is replaced as the slip is: smooth at rest, exact at the limit.
+    """
+    tool = model.machine.tool
+    if tool is None:
+        return
+    place = tool_point(model.machine, model.true_coordinates(s.q, model.nominal))
+    if tool.low is not None and tool.high is not None:
+        for axis, letter in enumerate("xyz"):
+            yield f"tool {letter}", place[axis], tool.low[axis], tool.high[axis], "m"
+    if tool.speed is not None:
+        high = float(tool.speed)
+        square = (1 - TOOL_ROUNDING**2) * ca.sumsqr(ca.jtimes(place, s.q, s.nu)) + (TOOL_ROUNDING * high) ** 2
+        yield "tool speed", ca.sqrt(square), -np.inf, high, "m/s"
+
+
 def polygon_edges(corners: Sequence[tuple[float, float]]) -> list[tuple[np.ndarray, float, float]]:
     """Return the edges of a convex area as (outward normal (2,), low, high).
 
@@ -202,7 +229,15 @@ def polygon_edges(corners: Sequence[tuple[float, float]]) -> list[tuple[np.ndarr
 LIMITS: dict[str, LimitKind] = {
     "torque": LimitKind(_torque, ("body.limit.torque",)),
     "torque_rate": LimitKind(_torque_rate, ("body.limit.torque_rate",)),
-    "position": LimitKind(_position, ("body.limit.position", "body.limit.position_low", "body.limit.position_high")),
+    "position": LimitKind(
+        _position,
+        (
+            "body.limit.position",
+            "body.limit.position_low",
+            "body.limit.position_high",
+            "body.limit.position_margin",
+        ),
+    ),
     "rate": LimitKind(_rate, ("body.limit.rate",)),
     "rim_speed": LimitKind(_rim_speed, ("body.limit.rim_speed",)),
     "slip": LimitKind(_slip, ("body.contact.slip_limit",)),
@@ -210,6 +245,8 @@ LIMITS: dict[str, LimitKind] = {
     "lane": LimitKind(_lane, ("problems.lane_m", "problems.lane_polygon_m")),
     "polygon": LimitKind(_polygon),
     "travel": LimitKind(_travel),
+    "clearance": LimitKind(_clearance, ("body.shape", "world")),
+    "tool": LimitKind(_tool, ("tool.low", "tool.high", "tool.speed")),
 }
 
 
@@ -230,11 +267,37 @@ def machine_limits(model: Model, problem: Problem) -> tuple[Limit, ...]:
     )
 
 
+def planned_limits(model: Model) -> tuple[Limit, ...]:
+    """Return the limits on acceleration and jerk of a planned motion, of joints that state them.
+
+    Their expressions are functions of (a, jerk), each (n_q,). A simulated motion has none: friction that turns makes
+    its acceleration jump.
+    """
+    n_q = len(model.coordinates)
+    a, jerk = ca.SX.sym("a", n_q), ca.SX.sym("jerk", n_q)
+    found = []
+    for name, x, unit in (("acceleration", a, "s2"), ("jerk", jerk, "s3")):
+        for body in model.machine.body:
+            most = getattr(body.limit, name)
+            if most is not None and model.machine.is_free(body):
+                value = ca.Function("limit", [a, jerk], [model.machine.joint_values(body, x)])
+                of = f"{'rad' if body.joint == 'revolute' else 'm'}/{unit}"
+                found.append(Limit(f"{name} {body.where}", value, -float(most), float(most), of, name))
+    return tuple(found)
+
+
+def stack_planned(model: Model, limits: Sequence[Limit]) -> ca.Function:
+    """Return the function (a, jerk) -> values (n_limits,) of `planned_limits`."""
+    n_q = len(model.coordinates)
+    a, jerk = ca.SX.sym("a", n_q), ca.SX.sym("jerk", n_q)
+    return ca.Function("planned", [a, jerk], [ca.vertcat(ca.SX(0, 1), *[g.expression(a, jerk) for g in limits])])
+
+
 def stack_limits(model: Model, limits: Sequence[Limit]) -> ca.Function:
     """Return the function (q, nu, u, du) -> values (n_limits,)."""
     s = sample_symbols(model)
     sample = [s.q, s.nu, s.u, s.du]
-    return ca.Function("limits", sample, [ca.vertcat(*[g.expression(*sample) for g in limits])])
+    return ca.Function("limits", sample, [ca.vertcat(*[g.expression(*sample) for g in limits])], {"cse": True})
 
 
 def is_lane_limit(name: str) -> bool:
@@ -274,17 +337,20 @@ def resting_coordinates(model: Model) -> tuple[int, ...]:
 
 def end_poses(model: Model, problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Return the coordinates (n_q,) at the start and at the end, as `Problem` says."""
-    start = np.zeros(len(model.coordinates))
-    for body in model.machine.body:
-        if body.limit.position_range is not None and body.coordinates[0] in model.coordinates:
-            low, high = body.limit.position_range
-            start[model.coordinates.index(body.coordinates[0])] = 0.0 if low <= 0 <= high else (low + high) / 2
+    low, high = drive_ranges(model)
+    start = np.where((low <= 0) & (high >= 0), 0.0, (low + high) / 2)
     for c, place in problem.start_pose.items():
         start[model.coordinates.index(c)] = place
     end = start.copy()
     for c, place in problem.end_pose.items():
         end[model.coordinates.index(c)] = place
     return start, end
+
+
+def chosen_poses(model: Model, problem: Problem) -> tuple[int, ...]:
+    """Return the coordinates of an arm whose pose at start and end the search chooses: those that have none given."""
+    given = {*problem.start_pose, *problem.end_pose}
+    return tuple(k for k, c in enumerate(model.coordinates) if model.follows_positions and c not in given)
 
 
 def rest_tolerances(model: Model) -> np.ndarray:
@@ -330,7 +396,19 @@ def _rest(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
         for k, c in enumerate(model.coordinates)
     }
     away = np.abs(motion.q[[0, -1]] - end_poses(model, problem)).max(axis=0) / REST_POSITION - 1
-    return still | {f"rest {model.coordinates[k]}": max(0.0, float(away[k])) for k in resting_coordinates(model)}
+    given = [k for k in resting_coordinates(model) if k not in chosen_poses(model, problem)]
+    return still | {f"rest {model.coordinates[k]}": max(0.0, float(away[k])) for k in given}
+
+
+def describe_excess(model: Model, name: str, excess: float) -> str:
+    """Say by how much a drive exceeds a limit; of rest at the ends, how fast it moves or how far it is off."""
+    for k, c in enumerate(model.coordinates):
+        unit = "rad" if c.startswith("theta") else "m"
+        if name == f"rest {c}'":
+            return f"{c} still moves at {format_number((1 + excess) * rest_tolerances(model)[k], 3)} {unit}/s at an end"
+        if name == f"rest {c}":
+            return f"{c} is {format_number((1 + excess) * REST_POSITION, 3)} {unit} off its pose at an end"
+    return f"{name} is exceeded by {100 * excess:.2f} % of its range"
 
 
 def _reversals(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:

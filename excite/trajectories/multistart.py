@@ -16,7 +16,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import joblib
 import numpy as np
@@ -43,9 +43,21 @@ from excite.trajectories.continuation import (
     start_from_multisine,
 )
 from excite.trajectories.excitation import Manoeuvre
-from excite.trajectories.limits import move_motion, place_along_lane
+from excite.trajectories.limits import describe_excess, move_motion, place_along_lane
 
-Report = Callable[[int, int, float], None]
+
+class BestSoFar(float):
+    """The best score so far, inf without a drive within all limits; `doing`: what is tried, and what is wrong."""
+
+    doing: str
+
+    def __new__(cls, score: float, doing: str = "") -> Self:
+        made = super().__new__(cls, score)
+        made.doing = doing
+        return made
+
+
+Report = Callable[[int, int, BestSoFar], None]
 MIN_LATER_STEPS = len(STAGES) - SCREENING_STAGES + 1  # progress reports of a selected start, at least
 
 
@@ -55,10 +67,11 @@ class Design:
 
     cond_phi, cond_w: condition numbers over every sample of `motion`. cond_phi_start: of the best random start.
     violations: excess by limit, as a fraction of its range, 0 where kept. scores: the objective of every start as
-    reported, inf for an infeasible one. complete: False if interrupted or cut short by the budget. solver: a name in
-    SOLVERS; iterations: of the solver, from the start that won to this drive. trajectory: kind of joint motion, a name
-    in TRAJECTORIES, None for torques; limits of a joint motion are also judged between samples. followed: excess over
-    them where a position controller follows the motion, None if that was not simulated.
+    reported, inf for an infeasible one. random: the multisines that the search began from. complete: False if
+    interrupted or cut short by the budget. solver: a name in SOLVERS; iterations: of the solver, from the start
+    that won to this drive. trajectory: kind of joint motion, a name in TRAJECTORIES, None for torques; limits of a
+    joint motion are also judged between samples. followed: excess over them where a position controller follows the
+    motion, None if that was not simulated.
     """
 
     objective: str
@@ -75,6 +88,7 @@ class Design:
     iterations: int = 0
     trajectory: str | None = None
     followed: dict[str, float] | None = None
+    random: tuple[Manoeuvre, ...] = ()
 
 
 def design(
@@ -93,8 +107,8 @@ def design(
     objective: a name in OBJECTIVES or the result of `compose_objective`.
     starts: random multisines to start from; the best third (two at least) goes through all stages.
     budget_s [s]: ends the search with the best feasible drive so far; half of it is for the first stages. Ctrl-C does
-        so too, and raises KeyboardInterrupt if there is no such drive yet.
-    progress(done, total, best score): called as stages finish.
+        so too, and raises KeyboardInterrupt if there is no such drive yet; it says why.
+    progress(done, total, best score): called as stages finish; the score is a `BestSoFar`.
     warm: drives that start at the last stages; `starts` may then be 0.
     solver: a name in SOLVERS.
 
@@ -116,7 +130,7 @@ def design(
     states: dict[int, SearchState] = {}
     with (
         stop_file() as stop,
-        progress_reports(stop.parent, progress, starts * SCREENING_STAGES + kept * MIN_LATER_STEPS),
+        progress_reports(stop.parent, progress, starts * SCREENING_STAGES + kept * MIN_LATER_STEPS, len(guesses)),
         joblib.parallel_config("loky", inner_max_num_threads=1),
     ):
         # loky even for one start: only its workers can limit the threads of the linear algebra
@@ -139,11 +153,11 @@ def design(
     best = min(states.values(), key=lambda t: (t.failure is not None, *rank(t.best), t.number))
     complete = len(states) == len(guesses) and all(states[t.number].complete for t in chosen)
     if not best.best.feasible and interrupted:
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(no_drive_yet(best.best.violations))
     if best.failure is not None:
         raise _no_optimum(solver, best, len(guesses))
     if not best.best.feasible:
-        raise infeasible_error(composite, best.best.violations, complete)
+        raise infeasible_error(model, composite, best.best.violations, complete)
     drive = best.best
     motion = simulate(model, drive.manoeuvre.sample(float(model.machine.sampling_hz)), q0=drive.start)
     along = place_along_lane(model, problem, [motion])
@@ -161,6 +175,7 @@ def design(
         complete,
         solver,
         best.iterations,
+        random=tuple(states[k].begun_from for k in range(starts) if k in states),
     )
 
 
@@ -199,7 +214,15 @@ def _no_optimum(solver: str, best: SearchState, starts: int) -> SolverError:
     )
 
 
-def infeasible_error(objective: CompositeObjective, violations: Mapping[str, float], complete: bool) -> InfeasibleError:
+def no_drive_yet(violations: Mapping[str, float]) -> str:
+    """Say why there is no drive yet: the limit that is exceeded most, and by how much."""
+    name = max(violations, key=lambda limit: violations[limit])
+    return f"no drive within all limits yet: {name.replace('_', ' ')} {format_percent(100 * violations[name], 2)} over"
+
+
+def infeasible_error(
+    model: Model, objective: CompositeObjective, violations: Mapping[str, float], complete: bool
+) -> InfeasibleError:
     """Build the error that names the limit with the largest excess."""
     name = max(violations, key=lambda limit: violations[limit])
     excess = violations[name]
@@ -213,9 +236,11 @@ def infeasible_error(objective: CompositeObjective, violations: Mapping[str, flo
             name,
             excess,
         )
+    more = "give another duration or more starts"
+    change = more if name.startswith("rest ") else f"widen it, or {more}"
     return InfeasibleError(
-        f"no drive found that keeps every limit: {name} is exceeded by {100 * excess:.2f} % of its range in the"
-        f" best attempt; {'widen it, or give another duration or more starts' if complete else cut}",
+        f"no drive found that keeps every limit: {describe_excess(model, name, excess)} in the best attempt;"
+        f" {change if complete else cut}",
         name,
         excess,
     )
@@ -241,19 +266,24 @@ def stop_file() -> Iterator[Path]:
 
 
 @contextmanager
-def progress_reports(folder: Path, progress: Report | None, total: int) -> Iterator[None]:
-    """Call `progress` as workers write files START-STAGE with their best score."""
+def progress_reports(folder: Path, progress: Report | None, total: int, starts: int) -> Iterator[None]:
+    """Call `progress` as workers write files START-STAGE with their best score and what exceeds a limit."""
     if progress is None:
         yield
         return
     ended = threading.Event()
-    scores: dict[str, float] = {}
+    scores: dict[str, tuple[float, float, str]] = {}  # score, largest excess, and what it is
 
     def look() -> None:
         for path in folder.glob("*-*"):
             if path.name not in scores:
-                scores[path.name] = float(path.read_text(encoding="ascii"))
-                progress(min(len(scores), total), total, min(scores.values()))
+                score, excess, over = path.read_text(encoding="utf-8").split("\n")
+                scores[path.name] = float(score), float(excess), over
+                best, _, over = min(scores.values())
+                number, _, stage = path.name.partition("-")
+                doing = f"start {int(number) + 1} of {starts}, stage {int(stage) + 1} done"
+                note = doing if np.isfinite(best) else f"{doing}; {over}"
+                progress(min(len(scores), total), total, BestSoFar(best, note))
 
     def watch() -> None:
         while not ended.wait(0.2):
@@ -276,10 +306,14 @@ def begin_worker(stop: Path, deadline: float | None) -> Callable[[], bool]:
     return lambda: stop.exists() or (deadline is not None and time.time() > deadline)
 
 
-def write_stage(stop: Path, number: int, stage: int, score: float) -> None:
-    """Write the best score of a start after a stage beside the stop file, for `progress_reports`."""
+def write_stage(stop: Path, number: int, stage: int, score: float, violations: Mapping[str, float]) -> None:
+    """Write the best score of a start after a stage beside the stop file, for `progress_reports`.
+
+    violations: of the drive that has this score.
+    """
+    excess, over = max(violations.values(), default=0.0), no_drive_yet(violations) if violations else ""
     fresh = stop.parent / f".{number}"
-    fresh.write_text(repr(score), encoding="ascii")
+    fresh.write_text(f"{score!r}\n{excess!r}\n{over}", encoding="utf-8")
     fresh.replace(stop.parent / f"{number}-{stage}")
 
 
@@ -302,7 +336,7 @@ def _run_start(
     stages = itertools.count(0 if state is None else SCREENING_STAGES)
 
     def report_stage(state: SearchState) -> None:
-        write_stage(stop, number, next(stages), _score(objective, state.best))
+        write_stage(stop, number, next(stages), _score(objective, state.best), state.best.violations)
 
     if state is None:
         if number > 0 and should_stop():

@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 
 from excite.model import Model
+from excite.model.machine import noise_of
 from excite.simulation import Motion, effect_inputs
 from excite.text import format_number
 
@@ -300,7 +301,7 @@ def row_noise(model: Model) -> np.ndarray:
     the Cramer-Rao bound of all sensors does (rank correlation 0.95, above torque noise alone and equal rows).
     """
     machine = model.machine
-    torque = {s.body: float(s.noise) for s in machine.sensor if s.kind == "torque" and s.noise is not None}
+    torque = {s.body: noise_of(machine, s) for s in machine.sensor if s.kind == "torque" and s.noise is not None}
     known = [torque[b.index] for b in machine.actuated if b.index in torque]
     usual = float(np.mean(known)) if known else 1.0
     pushes = [torque.get(b.index, usual) / float(b.contact.radius) for b in machine.contacts if b.contact is not None]

@@ -50,11 +50,8 @@ def read_design_summary(design_dir: Path) -> dict[str, Any]:
     return dict(found)
 
 
-def read_design(design_dir: Path) -> SavedDesign:
-    """Read a design folder and simulate its profile.
-
-    Raises DesignFolderError, LogError, SimulationError.
-    """
+def read_design_model(design_dir: Path) -> Model:
+    """Read the model of a design folder, with the values that the design is for. Raises DesignFolderError."""
     before = read_design_summary(design_dir)
     path = design_dir / "machine.json"
     try:
@@ -65,10 +62,20 @@ def read_design(design_dir: Path) -> SavedDesign:
     try:
         # The design may be for values identified from logs. Those of sensors alone are not in the summary.
         nominal |= {n: float(x) for n, x in before.get("nominal", {}).items()}
-        seconds = float(before["duration_s"])
+        float(before["duration_s"])
     except (AttributeError, TypeError, ValueError):
         raise DesignFolderError(f"{design_dir / output.SUMMARY}: damaged, design again") from None
-    model = replace(model, nominal=np.array([nominal[n] for n in model.base.names]))
+    return replace(model, nominal=np.array([nominal[n] for n in model.base.names]))
+
+
+def read_design(design_dir: Path) -> SavedDesign:
+    """Read a design folder and simulate its profile.
+
+    Raises DesignFolderError, LogError, SimulationError.
+    """
+    before = read_design_summary(design_dir)
+    model = read_design_model(design_dir)
+    seconds = float(before["duration_s"])
     drive = logs.read_drive(design_dir / "profile.csv", model)
     torque = drive.torque
     if len(torque) != round(seconds * float(model.machine.sampling_hz)) + 1:

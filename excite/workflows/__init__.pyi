@@ -6,6 +6,7 @@ from .campaign_workflow import (
     check_campaign as check_campaign,
     read_targets as read_targets,
 )
+from .collision_shapes import add_shapes as add_shapes
 from .design_request import (
     DesignRequest as DesignRequest,
     design_from as design_from,
@@ -28,6 +29,8 @@ from .diagnose_workflow import (
     rivals as rivals,
     separating_drive as separating_drive,
 )
+from .fmi_model import MODEL_WRITERS as MODEL_WRITERS
+from .handover_workflow import hand_over as hand_over
 from .identify_workflow import (
     identify as identify,
     identify_account as identify_account,

@@ -20,7 +20,7 @@ from excite.errors import InfeasibleError, MachineError, SolverError, UsageError
 from excite.model import Model, build, effects, hidden_zeros, with_given_zeros
 from excite.model.machine import EffectEntry, Problem, Quantity
 from excite.operator import PhasedDrive
-from excite.trajectories import AccuracyBound, CompositeObjective, Design, design
+from excite.trajectories import AccuracyBound, CompositeObjective, Design, Manoeuvre, design
 
 DEFAULT_TRAJECTORY = "free"  # of an arm
 ASSUMED_TORQUE_NOISE = 0.005  # of the torque limit, standard deviation, without a figure of the sensor; chosen
@@ -30,6 +30,7 @@ BOUNDED: dict[str, Callable[[np.ndarray], float]] = {
     "worst": lambda sigma: float(sigma.max()),
     "accuracy": lambda sigma: float(np.sqrt(sigma.max() * sigma.mean())),
 }
+CEILINGS = (trajectories.COND_MAX, trajectories.SIGMA_MAX)  # limits of a search that are no limits of a drive
 SINGULAR_COND = 1e12  # cond(Phi) from which an arm's information matrix is singular to working accuracy; chosen
 POOR_PERCENT = 5.0  # attainable standard deviation [%] above which the summary gives advice; chosen
 ROBUST_MACHINES = 5  # machines of a robust design; chosen
@@ -49,6 +50,7 @@ class DesignRequest:
     between: two effects or more, NAME[@WHERE]=MAGNITUDE, that the drive must separate.
     trajectory: kind of joint motion of an arm, a name of `TRAJECTORIES`; None for the usual one, or torques of others.
     of: profile (.csv) or design folder of the drive to predict, for the objectives of a prediction.
+    other_end: with objective cond, also find the drive for accuracy alone, to compare with.
     driver: design for people, in phases of phase_min_s [s] or more.
     cond_slack [%]: with objective cond, by how much cond(Phi) may grow for the most accurate drive; 0 for the lowest.
     solver: a name of `SOLVERS`.
@@ -68,6 +70,7 @@ class DesignRequest:
     solver: str = "own"
     of: Path | None = None
     trajectory: str | None = None
+    other_end: bool = True
 
     @property
     def second_step(self) -> bool:
@@ -84,6 +87,8 @@ class DesignResult:
     contrasts (n_base, m): combinations of relative errors that the objective judges, None for each parameter.
     phased: the phases of a design for people; `design` is then the motion of a steady driver.
     first: the drive of lowest cond(Phi), if `design` is the most accurate one near it.
+    accurate: a drive for accuracy alone, to compare with; None without one. random_percent [%]: the worst parameter of
+    the most accurate random start.
     assumed_noise: sensors of an arm whose noise figure is assumed, as its machine file has none.
     given_zeros: encoder zeros that are sought, but that no torque shows by itself: the design takes the file's.
     bound: numerical lower bound of every drive, for objectives in BOUNDED of a machine with one driven joint.
@@ -98,6 +103,8 @@ class DesignResult:
     assumed_noise: tuple[str, ...] = ()
     given_zeros: tuple[str, ...] = ()
     bound: AccuracyBound | None = None
+    accurate: Design | None = None
+    random_percent: float | None = None
 
 
 def add_rival_effects(model: Model, between: tuple[str, ...], duration: float) -> Model:
@@ -190,11 +197,12 @@ def _design(
     aim = trajectories.compose_objective(model, request.objective, request.sigma_max, prior, machines, None, judged)
     if not request.driver:
         budget = request.budget_s if not request.second_step or request.budget_s is None else request.budget_s / 2
+        until = None if request.budget_s is None else time.time() + request.budget_s
         lowest = design(model, problem, aim, request.starts, request.seed, budget, progress, solver=request.solver)
         if not request.second_step:
             bound = _bound_on_objective(model, problem, request) if lowest.complete else None
             return DesignResult(model, aim, lowest, contrasts=judged, bound=bound)
-        return _make_accurate(model, problem, request, aim, lowest, prior, budget)
+        return _make_accurate(model, problem, request, aim, lowest, prior, until)
     begin = time.time()
     half = None if request.budget_s is None else request.budget_s / 2
     free = design(model, problem, aim, request.starts, request.seed, half, progress, solver=request.solver)
@@ -254,7 +262,7 @@ def with_assumed_noise(model: Model) -> tuple[Model, tuple[str, ...]]:
         limit = None if s.body is None else machine.find(s.body).limit.torque
         if s.kind == "torque" and limit is not None:
             noise = Quantity(value=ASSUMED_TORQUE_NOISE * float(limit), source="assumed")
-            found[s.name] = s.model_copy(update={"noise": noise})
+            found[s.name] = s.model_copy(update={"noise": noise, "noise_unit": "SI"})
         elif s.kind == "angle":
             found[s.name] = s.model_copy(
                 update={"counts_per_turn": Quantity(value=ASSUMED_COUNTS_PER_TURN, source="assumed")}
@@ -265,6 +273,45 @@ def with_assumed_noise(model: Model) -> tuple[Model, tuple[str, ...]]:
     return replace(model, machine=machine.model_copy(update={"sensor": sensors})), tuple(found)
 
 
+@dataclass(frozen=True)
+class _NearSearch:
+    """Searches that begin from drives that are known. until: time at which they end, None for no limit."""
+
+    model: Model
+    problem: Problem
+    request: DesignRequest
+    prior: np.ndarray | None
+    until: float | None
+
+    def find(
+        self,
+        objective: str,
+        warm: Sequence[Manoeuvre],
+        share: float,
+        sigma_max: float | None = None,
+        cond_max: float | None = None,
+    ) -> Design | None:
+        """Return the best drive near some, None if none keeps every limit. share: of the time that is left.
+
+        sigma_max, cond_max: see `trajectories.compose_objective`. Raises KeyboardInterrupt.
+        """
+        left = None if self.until is None else share * (self.until - time.time())
+        if left is not None and left <= 0:
+            return None
+        aim = trajectories.compose_objective(self.model, objective, sigma_max, self.prior, cond_max=cond_max)
+        request = self.request
+        try:
+            return design(self.model, self.problem, aim, 0, request.seed, left, None, warm, request.solver)
+        except (InfeasibleError, SolverError):
+            return None
+
+    def worst(self, drive: Manoeuvre) -> float:
+        """Return the attainable standard deviation [%] of the worst parameter along a drive."""
+        motion = simulation.simulate(self.model, drive.sample(float(self.model.machine.sampling_hz)))
+        aim = trajectories.compose_objective(self.model, "cond", prior=self.prior)
+        return float(trajectories.sigma_percent(aim, self.model, motion).max())
+
+
 def _make_accurate(
     model: Model,
     problem: Problem,
@@ -272,28 +319,39 @@ def _make_accurate(
     aim: CompositeObjective,
     lowest: Design,
     prior: np.ndarray | None,
-    budget: float | None,
+    until: float | None,
 ) -> DesignResult:
-    """Find the most accurate drive (worst parameter) whose cond(Phi) is within `cond_slack` of the lowest one."""
-    cond_max = (1 + request.cond_slack / 100) * lowest.cond_phi
-    near = trajectories.compose_objective(model, "worst", prior=prior, cond_max=cond_max)
+    """Find the most accurate drive (worst parameter) whose cond(Phi) is within `cond_slack` of the lowest one.
+
+    If a random start is still more accurate, the drive of lowest cond(Phi) that is as accurate takes its place. The
+    drive for accuracy alone is found as well, to compare with. until: time at which the search ends.
+    """
+    search = _NearSearch(model, problem, request, prior, until)
+    found, ends = lowest, DesignResult(model, aim, lowest)
     try:
-        accurate = design(model, problem, near, 0, request.seed, budget, None, [lowest.manoeuvre], request.solver)
-    except (InfeasibleError, SolverError):
-        return DesignResult(model, aim, lowest)
+        cond_max = (1 + request.cond_slack / 100) * lowest.cond_phi
+        found = search.find("worst", [lowest.manoeuvre], 0.5, cond_max=cond_max) or lowest
+        reached = {k: search.worst(drive) for k, drive in enumerate(lowest.random)}
+        best = min(reached, key=lambda k: reached[k], default=None)
+        if best is not None and search.worst(found.manoeuvre) > reached[best]:
+            warm = [found.manoeuvre, lowest.random[best]]
+            found = search.find("cond", warm, 0.5, sigma_max=reached[best]) or found
+        accurate = search.find("accuracy", [found.manoeuvre], 1.0) if request.other_end else None
+        ends = replace(ends, accurate=accurate, random_percent=None if best is None else reached[best])
     except KeyboardInterrupt:
-        return DesignResult(model, aim, replace(lowest, complete=False))
-    complete = lowest.complete and accurate.complete
+        lowest = replace(lowest, complete=False)
+    if found is lowest or np.isclose(found.cond_phi, lowest.cond_phi, rtol=1e-9):
+        return replace(ends, design=lowest)
     found = replace(
-        accurate,
+        found,
         objective=lowest.objective,
         cond_phi_start=lowest.cond_phi_start,
         scores=lowest.scores,
-        iterations=lowest.iterations + accurate.iterations,
-        complete=complete,
-        violations={n: v for n, v in accurate.violations.items() if n != trajectories.COND_MAX},
+        iterations=lowest.iterations + found.iterations,
+        complete=lowest.complete and found.complete,
+        violations={n: v for n, v in found.violations.items() if n not in CEILINGS},
     )
-    return DesignResult(model, aim, found, first=lowest)
+    return replace(ends, design=found, first=lowest)
 
 
 def _bound_on_objective(model: Model, problem: Problem, request: DesignRequest) -> AccuracyBound | None:
@@ -346,18 +404,17 @@ def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, 
         "trajectory": drive.trajectory,
         "iterations": drive.iterations,
     }
+    if drive.trajectory is not None:
+        summary |= _arm_summary(result.model, drive)
     if drive.followed is not None:
         summary["followed"] = dict(drive.followed)
     if result.first is not None:
-        first = trajectories.sigma_percent(result.aim, result.model, result.first.motion)
-        summary["cond_slack_percent"] = request.cond_slack
-        summary["lowest_cond"] = {
-            "cond_phi": result.first.cond_phi,
-            "cond_w": result.first.cond_w,
-            "worst_parameter": names[int(np.argmax(first))],
-            "worst_percent": float(first.max()),
-            "median_percent": float(np.median(first)),
-        }
+        summary["cond_slack_percent"] = max(request.cond_slack, 100 * (drive.cond_phi / result.first.cond_phi - 1))
+        summary["lowest_cond"] = _end(result, result.first)
+    if result.accurate is not None:
+        summary["most_accurate"] = _end(result, result.accurate)
+    if result.random_percent is not None:
+        summary["random_start_percent"] = result.random_percent
     if result.assumed_noise:
         summary["assumed_noise"] = list(result.assumed_noise)
     if result.given_zeros:
@@ -385,6 +442,32 @@ def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, 
         summary["after"] = [str(p) for p in request.after]
         summary["nominal"] = dict(zip(names, result.model.nominal.tolist(), strict=True))
     return summary
+
+
+def _end(result: DesignResult, drive: Design) -> dict[str, Any]:
+    """Summarise a drive beside the one that was designed."""
+    sigma = trajectories.sigma_percent(result.aim, result.model, drive.motion)
+    return {
+        "cond_phi": drive.cond_phi,
+        "cond_w": drive.cond_w,
+        "worst_parameter": result.model.base.names[int(np.argmax(sigma))],
+        "worst_percent": float(sigma.max()),
+        "median_percent": float(np.median(sigma)),
+    }
+
+
+def _arm_summary(model: Model, drive: Design) -> dict[str, Any]:
+    """Summarise what belongs to arms: where the motion starts, and what its search knew of things to run into."""
+    world = model.machine.world
+    return {
+        "start": dict(zip(model.coordinates, drive.motion.q[0].tolist(), strict=True)),
+        "collisions": {
+            "looked_at": trajectories.has_shapes(model.machine),
+            "margin_m": float(world.margin),
+            "floor_m": None if world.floor == "none" else float(world.floor),
+            "left_out": [list(pair) for pair in trajectories.pairs_left_out(model)],
+        },
+    }
 
 
 def _by_hand(request: DesignRequest, aim: CompositeObjective, made: PhasedDrive) -> dict[str, Any]:
@@ -421,5 +504,5 @@ def advice(request: DesignRequest, worst: str, percent: float) -> str | None:
         return f"poor accuracy: {poor}; drive longer, or on more room"
     return (
         f"cond(Phi) says nothing of accuracy here: {poor}; --objective accuracy designs for small errors"
-        " (run it to see how small), --sigma-max PERCENT for the lowest cond(Phi) among drives that are accurate enough"
+        ", --sigma-max PERCENT for the lowest cond(Phi) among drives that are accurate enough"
     )

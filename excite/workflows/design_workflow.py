@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from excite import reports, trajectories
-from excite.errors import MachineError, UsageError
+from excite.errors import MachineError, StoppedError, UsageError
 from excite.logs import profile_of, read_drive, torque_column
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Problem
@@ -72,6 +72,10 @@ def design_model(
                 f"{model.machine.name}: {design_request.singular_message(name)}; is an effect outside of what the drive"
                 " can reach?"
             ) from None
+        except KeyboardInterrupt as stopped:
+            if not str(stopped):
+                raise
+            raise StoppedError(f"interrupted, nothing was written: {stopped}") from None
     wall = time.perf_counter() - begin
     return design_account(found, name, chosen, request, wall).write(place)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,13 +13,15 @@ from matplotlib.figure import Figure
 
 from excite import identification, reports
 from excite.errors import LogError, NoEstimateError, NotIdentifiableError, SimulationError
-from excite.identification import FILTERS, Agreement, Estimate, describe_late_channels
+from excite.identification import FILTERS, Agreement, Estimate, SignalComparison, describe_late_channels
 from excite.logs import Log, Prepared, examine, moves, prepare
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Filter
 from excite.reports import Account
 from excite.workflows import requests
+from excite.workflows.machine_check import require_no_fault
 from excite.workflows.progress import Bar, no_bar
+from excite.workflows.residuals import describe_residuals
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,8 @@ def identify_from(model: Model, logs: Sequence[Log], method: str, filtering: str
         raise NotIdentifiableError(f"{identification.describe_agreement(agreement)}; together: {err}") from None
     if agreement is not None and not agreement.agree and estimate.status == "valid":
         estimate = replace(estimate, status="doubtful", doubt="the logs do not agree on the parameters")
+    if agreement is not None:
+        estimate = identification.widen(estimate, agreement.ratio)
     used = [examine(model.machine, one).log for one in logs]
     if model.slips and identification.METHODS[method].biased:
         estimate = identification.add_bias(model, used, estimate, chosen)
@@ -60,6 +64,10 @@ def identify_from(model: Model, logs: Sequence[Log], method: str, filtering: str
             )
     found = estimate.value if estimate.method == "joint" and np.isfinite(estimate.value).all() else None
     late = [remark for one in used for remark in describe_late_channels(model, one, chosen, found)]
+    if estimate.tests:
+        late = []  # the alignment is one of the tests
+    elif late and estimate.status == "valid":
+        estimate = replace(estimate, status="doubtful", doubt=late[0])
     first = (reason,) if reason else ()
     notes = (*first, *estimate.notes, *identification.far_from_nominal(model, estimate), *late)
     estimate = identification.add_consistent(model, replace(estimate, notes=notes))
@@ -83,9 +91,10 @@ def identify(
     machine: a shipped name or a path. method: None for the recommended one. filtering: a name of `FILTERS`.
     validate: logs that are not fitted, only predicted. unloaded: folder of an estimate of the machine without the
     payload that it carries in the logs. accepted: why doubts about the logs may stand.
-    Raises LogError, NoEstimateError, UsageError, EstimateFolderError.
+    Raises LogError, NoEstimateError, UsageError, EstimateFolderError, MachineError for a machine that `check` refuses.
     """
     as_in_file = model = requests.build_model(machine)
+    require_no_fault(model, machine)
     before = None if unloaded is None else identification.read_estimate(unloaded).estimate
     method = requests.choose_method(method, model)
     needs = identification.needed_sensors(model, method)
@@ -106,6 +115,11 @@ def identify(
     return identify_account(as_in_file, ready, found, unfitted, more_notes, before, accepted).write(place)
 
 
+def _as_compared(comparison: SignalComparison) -> SignalComparison:
+    """Return a comparison that is made already."""
+    return comparison
+
+
 def identify_account(
     as_in_file: Model,
     ready: Prepared,
@@ -121,7 +135,13 @@ def identify_account(
     unloaded: estimate without the payload. accepted: why doubts about the logs may stand.
     """
     model, read, estimate, chosen = ready.model, found.logs, found.estimate, found.filter
+    compared = [identification.compare_torques(model, one, estimate, chosen) for one in read]
     said = [] if found.agreement is None else [identification.describe_agreement(found.agreement)]
+    checks = [_check(model, one, read, estimate, chosen) for one in unfitted]
+    missed = dict.fromkeys(x["signal"] for c in checks if not c["fitted"] for x in c["outside"])
+    if missed and estimate.status == "valid":
+        doubt = f"the bands miss the data withheld: {', '.join(missed)}"
+        estimate = replace(estimate, status="doubtful", doubt=doubt)
     parameters = _parameters(estimate)
     summary = {
         "machine": model.machine.name,
@@ -130,10 +150,17 @@ def identify_account(
         "doubt": estimate.doubt,
         "method": estimate.method,
         "parameters": parameters,
+        "budget": estimate.budget,
+        "discrepancy": _discrepancy(estimate),
+        "tests": [
+            {"signal": t.signal, "test": t.what, "p_value": t.p_value, "fails": t.fails, "says": t.text}
+            for t in estimate.tests
+        ],
         "meanings": parameter_descriptions(model),
         "cond_w": estimate.cond_w,
         "cond_phi": estimate.cond_phi,
         "relative_error_percent": estimate.relative_error_percent,
+        "fit": describe_residuals(compared, chosen),
         "error_by_joint": _error_by_joint(model, read, estimate, chosen),
         "degrees": estimate.degrees,
         "share_outside_law": estimate.share_outside_law,
@@ -147,19 +174,38 @@ def identify_account(
         ),
         "accepted": accepted,
         "agreement": None if found.agreement is None else identification.summarise_agreement(found.agreement),
-        "validation": [_check(model, one, read, estimate, chosen) for one in unfitted],
+        "validation": checks,
         "versions": requests.package_versions(),
     }
+    if (constant := identification.torque_constant(model, estimate)) is not None:
+        summary["torque_constant"] = {
+            "value": constant.value,
+            "std": constant.std,
+            "low95": constant.interval95[0],
+            "high95": constant.interval95[1],
+            "unit": constant.unit,
+            "known": list(constant.known),
+            "p_value": constant.p_value,
+        }
     if unloaded is not None:
         summary["payload"] = _payload(identification.payload_parameters(model, estimate, unloaded))
+    fits: list[tuple[str, list[tuple[Log, Callable[[], SignalComparison]]]]] = [
+        ("fit", [(one, partial(_as_compared, c)) for one, c in zip(read, compared, strict=True)]),
+        (
+            "validation",
+            [(one, partial(identification.compare_torques, model, one, estimate, chosen)) for one in unfitted],
+        ),
+    ]
     figures = {
-        f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png": partial(_fit_figure, model, one, estimate, chosen)
-        for kind, several in (("fit", read), ("validation", unfitted))
-        for k, one in enumerate(several)
+        f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png": partial(_fit_figure, model, one, compare)
+        for kind, several in fits
+        for k, (one, compare) in enumerate(several)
     }
     title = f"{model.machine.title}, {estimate.method}"
     if estimate.status != "invalid" and np.isfinite(estimate.std).any():
         figures["correlation.png"] = partial(reports.correlation_figure, estimate, title)
+        if estimate.tolerated:
+            figures["budget.png"] = partial(reports.budget_figure, estimate, title)
         if estimate.prior_std is not None and (np.isfinite(estimate.prior_std) & (estimate.prior_std > 0)).any():
             figures["prior.png"] = partial(reports.prior_figure, estimate, as_in_file.nominal, title)
     return Account(
@@ -171,9 +217,18 @@ def identify_account(
     )
 
 
-def _fit_figure(model: Model, one: Log, estimate: Estimate, chosen: Filter) -> Figure:
-    torques = identification.compare_torques(model, one, estimate, chosen)
-    return reports.comparison_figure(model, torques, f"{model.machine.title}: {one.source}")
+def _fit_figure(model: Model, one: Log, compare: Callable[[], SignalComparison]) -> Figure:
+    return reports.comparison_figure(model, compare(), f"{model.machine.title}: {one.source}")
+
+
+def _discrepancy(estimate: Estimate) -> dict[str, Any]:
+    """Return by signal what the model lacks there and the intervals contain."""
+    found: dict[str, Any] = {}
+    for d in estimate.discrepancy:
+        own = found.setdefault(d.signal, {"rms": 0.0, "unit": d.unit, "parts": []})
+        own["rms"] = float(np.hypot(own["rms"], d.rms))
+        own["parts"].append({"kind": d.kind, "rms": d.rms, "scale": d.scale})
+    return found
 
 
 def _error_by_joint(model: Model, read: Sequence[Log], estimate: Estimate, chosen: Filter) -> dict[str, Any]:
@@ -200,6 +255,7 @@ def _parameters(estimate: Estimate) -> dict[str, dict[str, Any]]:
             "value": estimate.value[k],
             "std": estimate.std[k],
             "std_percent": estimate.std_percent[k],
+            "std_total": estimate.std_total[k],
             "low95": low[k],
             "high95": high[k],
             "possible": estimate.possible is None or bool(estimate.possible[k]),

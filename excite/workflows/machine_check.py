@@ -31,6 +31,8 @@ from excite.simulation import simulate
 from excite.text import format_number
 from excite.workflows.machine_units import UNIT_DOUBTS
 from excite.workflows.requests import LONGEST_DRIVE_S
+from excite.workflows.sensor_table import sensor_rows
+from excite.workflows.wiring import write_wiring
 
 PICTURE = "machine.png"
 LINEAR_SLIP = 0.15  # slip up to which the linear law holds, for a contact without a limit; as on va12
@@ -95,6 +97,14 @@ def check_file(path: Path) -> MachineCheck:
     ]
     remarks = () if faults else tuple(describe_invisible(model))
     return MachineCheck(tuple(faults), tuple(doubts), remarks, None if read.lines else model, sigma)
+
+
+def require_no_fault(model: Model, name: str) -> None:
+    """Raise MachineError for a machine, given by name or file, that its check refuses."""
+    faults = [line for rule in FAULTS for line in rule(model)]
+    if faults:
+        more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+        raise MachineError(f"{name}: {faults[0]}{more}; `excite machine check` says where")
 
 
 # ------------------------------------------------------------------------------------------------ faults
@@ -250,7 +260,8 @@ def _bodies(model: Model) -> Iterator[str]:
         i = b.inertia
         if i is None:
             continue
-        away, around = float(np.linalg.norm(i.com.value)), float(np.sqrt(float(i.ZZ) / float(i.mass)))
+        mass = float(i.mass) or np.inf  # a body without mass is named elsewhere
+        away, around = float(np.linalg.norm(i.com.value)), float(np.sqrt(float(i.ZZ) / mass))
         if away > reach:
             yield (
                 f"{b.name}: inertia.com: {format_number(away, 3)} m from its frame, the machine is"
@@ -266,6 +277,24 @@ def _bodies(model: Model) -> Iterator[str]:
                 f"{b.name}: inertia.ZZ: {float(i.ZZ):g} kg m2 is more than a flat disc has beside XX {float(i.XX):g}:"
                 " right only with a motor behind its gear in it"
             )
+
+
+def _massless(model: Model) -> Iterator[str]:
+    for b in model.machine.body:
+        if b.inertia is not None and not float(b.inertia.mass):
+            yield (
+                f"{b.name}: inertia.mass: 0 kg: the body weighs nothing in what is simulated and designed; give its"
+                " mass, centre of mass and inertia"
+            )
+
+
+def _rounded_angles(model: Model) -> Iterator[str]:
+    for b in model.machine.body:
+        for key in ("gamma", "alpha", "theta"):
+            value = float(getattr(b, key))
+            taken = mechanics.round_angle(value)
+            if abs(value - taken) > 1e-7:  # beyond the digits of pi that everyone writes
+                yield f"{b.name}: {key}: {value:.10g} rad is taken for {taken:.10g}, a multiple of pi/4"
 
 
 def _sizes(model: Model) -> Iterator[str]:
@@ -370,7 +399,8 @@ def _scales(model: Model) -> Iterator[str]:
 
 
 DOUBTS: tuple[Callable[[Model], Iterator[str]], ...] = (
-    *(_traction, _speed, _bounds, _bodies, _sizes, _slips, _effects, _times, _turning, _noise, _scales),
+    *(_traction, _speed, _bounds, _bodies, _massless, _rounded_angles, _sizes, _slips, _effects, _times, _turning),
+    *(_noise, _scales),
 )
 
 
@@ -451,7 +481,10 @@ def _random_drive_sigma(model: Model) -> dict[str, float]:
 
 
 def check_machine(place: Path, path: Path, versions: dict[str, str]) -> dict[str, Any]:
-    """Check a machine file into a folder with figure and report; return the summary. Raises MachineError."""
+    """Check a machine file into a folder with figure, report and the lists for the logger; return the summary.
+
+    Raises MachineError.
+    """
     found = check_file(path)
     model = found.model
     summary: dict[str, Any] = {
@@ -463,12 +496,15 @@ def check_machine(place: Path, path: Path, versions: dict[str, str]) -> dict[str
         "remarks": list(found.remarks),
         "coordinates": list(model.coordinates) if model else [],
         "inputs": list(model.inputs) if model else [],
+        "sensors": sensor_rows(model.machine) if model else [],
         "parameters": _parameters(model, found.sigma_percent) if model else {},
         "invisible": list(model.base.invisible) if model else [],
         "versions": versions,
     }
     if model is not None and model.machine.planar:
         reports.save(reports.top_view_figure(model.machine), place / PICTURE)
+    if model is not None:
+        write_wiring(model.machine, place)
     reports.write_report(place, "machine", summary)
     return summary
 

@@ -14,6 +14,7 @@ from excite.model import mechanics
 from excite.model.effects import GRAVITY
 from excite.model.machine import Body, Machine, Sensor
 from excite.text import format_number
+from excite.workflows.sensor_table import doubt_sensors
 
 BAR = 1e5  # Pa
 MAX_LENGTH = 30.0  # [m] of the table
@@ -23,7 +24,6 @@ ROLL_WIDTH = 1.0  # [m] from which a contact is a roll, not a wheel
 MAX_RATE = 60.0  # [rad/s] of a joint without contact: 570 rpm
 MAX_SLIDE = 50.0  # [m] of a sliding joint
 MAX_SMOOTHING = 1.0  # [rad/s]
-MAX_ANGLE_NOISE = 0.2  # [rad], [rad/s]
 DENSITY = (2.0, 2e4)  # [kg/m3] mass over the cube of the machine's length
 SPIN_SHARE = 0.1  # least spin inertia of a wheel over mass x radius^2; a hoop has 1, a disc 0.5
 MAX_DISPLACEMENT = 0.1  # [m3 per turn of the joint]
@@ -32,7 +32,6 @@ PRESSURE = (20 * BAR, 1000 * BAR)  # that a limit of torque may ask for
 SLOWEST_LOOP = 0.5  # usual time constant and dead time of a drive's loop [s]; chosen
 FULL_SCALE = {"V": 10.0, "mV": 10e3, "mA": 20.0}  # largest reading of sensors with a factor
 SCALE_TIMES = 8.0  # times that a sensor's range may exceed the pressure at the limit of torque
-COLUMN_UNITS = {"angle": "rad", "yaw_rate": "rad/s"}
 
 
 def _angles(machine: Machine) -> Iterator[str]:
@@ -47,11 +46,6 @@ def _angles(machine: Machine) -> Iterator[str]:
                 f"{b.name}: friction.smoothing: {float(b.friction.smoothing):g} rad/s, usual are {MAX_SMOOTHING:g} at"
                 " most: in deg/s?"
             )
-    for s in machine.sensors("full"):
-        unit = COLUMN_UNITS.get(s.kind)
-        sliding = machine.find(s.body).joint == "prismatic"
-        if unit and not sliding and s.noise is not None and float(s.noise) > MAX_ANGLE_NOISE:
-            yield f"sensor {s.name}: noise: {float(s.noise):g} {unit}{'/s' * s.is_rate}: in degrees? It is in SI units"
 
 
 def _lengths(machine: Machine) -> Iterator[str]:
@@ -169,14 +163,8 @@ def _pressures(machine: Machine, s: Sensor) -> Iterator[str]:
 
 
 def _readings(machine: Machine) -> Iterator[str]:
-    """Find noise of torques and rates of sampling in other units."""
+    """Find counts, loops and rates of sampling in other units."""
     for s in machine.sensors("full"):
-        top = machine.find(s.body).limit.torque
-        if s.kind == "torque" and s.noise is not None and top is not None and float(s.noise) > 0.5 * float(top):
-            yield (
-                f"sensor {s.name}: noise: {float(s.noise):g} {machine.si_unit(s)} beside limit.torque {float(top):g}:"
-                " it is in SI units, whatever the column is in"
-            )
         if s.counts_per_turn is not None and float(s.counts_per_turn) < 8:
             yield f"sensor {s.name}: counts_per_turn: {float(s.counts_per_turn):g}: the size of a count, or a ratio?"
         for key in ("time_constant", "dead_time") if s.loop is not None else ():
@@ -188,5 +176,5 @@ def _readings(machine: Machine) -> Iterator[str]:
 
 
 UNIT_DOUBTS: tuple[Callable[[Machine], Iterator[str]], ...] = (
-    *(_angles, _lengths, _speeds, _masses, _gravity, _power, _hydraulics, _readings),
+    *(_angles, _lengths, _speeds, _masses, _gravity, _power, _hydraulics, _readings, doubt_sensors),
 )

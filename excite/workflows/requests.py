@@ -89,7 +89,7 @@ CHOICES = {
     "friction": ("excite.simulation", "FRICTION_LAWS"),
     "effect": ("excite.model.effects", "CATALOGUE"),
 }
-MAX_LISTED = 12  # names that the help of an option lists; chosen
+MAX_LISTED = 16  # names that the help of an option lists; chosen
 
 
 def choices(option: str) -> tuple[str, ...]:

@@ -271,7 +271,10 @@ def _cell(v: dict[str, Any]) -> Cell:
 
 
 class Study(FileRecord):
-    """A study file. runs: of every cell. steps: of every run."""
+    """A study file. runs: of every cell. steps: of every run.
+
+    budget_s [s]: time after which each design ends with the best drive so far, which then depends on the computer.
+    """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,79}$")]
     title: Annotated[str, Field(max_length=200)] = ""
@@ -281,6 +284,7 @@ class Study(FileRecord):
         BeforeValidator(_as_list),
         Field(min_length=1),
     ] = ("verify",)
+    budget_s: Annotated[float | None, Field(gt=0, allow_inf_nan=False)] = None
     grid: Annotated[tuple[Grid, ...], BeforeValidator(_as_list)] = ()
     sample: Annotated[tuple[RandomSample, ...], BeforeValidator(_as_list)] = ()
 

@@ -28,6 +28,7 @@ from excite.workflows.study_runs import DEFECT, DONE, Row
 
 TABLE, FIGURE = "runs.parquet", "study.png"
 ROW_GROUP = 2000  # rows in memory at a time; chosen
+MIN_SWEPT = 3  # values of a number from which a study has it on an axis; chosen
 MAX_NAMED = 30  # cells that the figure names one by one; chosen
 
 COLUMNS = {  # of the table of runs, beside the estimates
@@ -270,9 +271,12 @@ def _cell_summary(s: CellResult, name: str) -> dict[str, Any]:
 
 def study_figure(results: Sequence[CellResult], title: str) -> Figure:
     """Plot cell by cell: errors and coverage of the parameters, or verdicts, or else the drives' condition numbers."""
+    swept = swept_quantity(results)
+    if swept is not None and all(s.rms for s in results):
+        return _swept_figure(results, *swept, title)
     names, n = cell_labels(results), len(results)
-    fig = Figure(figsize=(11.5, 1.6 + 0.3 * min(n, MAX_NAMED) + (2.5 if n > MAX_NAMED else 0)), layout="constrained")
-    fig.suptitle(reports.escape_dollar(title))
+    fig = reports.new_figure(11.5, 1.6 + 0.3 * min(n, MAX_NAMED) + (2.5 if n > MAX_NAMED else 0))
+    reports.set_title(fig, title)
     y = np.arange(n)
     if any(s.rms for s in results):
         left, right = fig.subplots(1, 2, sharey=True, width_ratios=(2, 1))
@@ -311,6 +315,51 @@ def study_figure(results: Sequence[CellResult], title: str) -> Figure:
     else:
         axes[0].set_ylabel("cell")
     axes[0].invert_yaxis()
+    return fig
+
+
+def swept_quantity(results: Sequence[CellResult]) -> tuple[str, list[float]] | None:
+    """Return the one number in which the cells differ, with its unit, and each cell's value; None if it is not one."""
+    parts = [_cell_axes(s) for s in results]
+    varied = [k for k in parts[0] if len({p[k] for p in parts}) > 1] if parts else []
+    drives = [s.cell.drive for s in results]
+    numbers: dict[str, tuple[str, list[float]]] = {
+        "duration": ("duration of the drive [s]", [float(d.duration_s or np.nan) for d in drives]),
+        "starts": ("random starts of the design [-]", [float(d.starts) for d in drives]),
+    }
+    if all(len(d.limits) == 1 for d in drives) and len({d.limits[0][0] for d in drives}) == 1:
+        numbers["limits"] = (f"factor of {drives[0].limits[0][0]} [-]", [d.limits[0][1] for d in drives])
+    if len(varied) != 1 or varied[0] not in numbers:
+        return None
+    label, values = numbers[varied[0]]
+    return (label, values) if len(values) >= MIN_SWEPT and np.isfinite(values).all() else None
+
+
+def _swept_figure(results: Sequence[CellResult], label: str, values: Sequence[float], title: str) -> Figure:
+    """Plot errors of the parameters and coverage over the one number that a study varies."""
+    narrow = reports.is_narrow(11.5)
+    fig = reports.new_figure(11.5, 6.4 if narrow else 4.4)
+    reports.set_title(fig, title)
+    errors, cover = fig.subplots(2, 1) if narrow else fig.subplots(1, 2, width_ratios=(2, 1))
+    order = np.argsort(values)
+    x, cells = np.array(values)[order], [results[k] for k in order]
+    for at, s in zip(x, cells, strict=True):
+        errors.plot([at] * len(s.rms), list(s.rms.values()), "o", color=COLOURS[0], markersize=3, alpha=0.5)
+    median = [float(np.median(list(s.rms.values()))) for s in cells]
+    errors.plot(x, median, "D-", color=COLOURS[1], markersize=5, label="median parameter")
+    errors.plot(x, [max(s.rms.values()) for s in cells], "s--", color=COLOURS[2], markersize=5, label="worst parameter")
+    errors.set_yscale("log")
+    errors.yaxis.set_major_formatter("{x:g}")
+    errors.set_ylabel("error, rms over the runs [%]", fontsize=9)
+    cover.plot(x, [100 * s.coverage for s in cells], "D-", color=COLOURS[1], markersize=5)
+    cover.axhline(95, color="black", linewidth=0.8, linestyle=(0, (2, 3)))
+    cover.set_ylim(0, 103)
+    cover.set_ylabel("95 % intervals that hold [%]", fontsize=9)
+    for ax in (errors, cover):
+        ax.set_xlabel(label, fontsize=9)
+        ax.tick_params(which="both", labelsize=8)
+        ax.grid(alpha=0.3)
+    reports.legend_below(fig, *errors.get_legend_handles_labels())
     return fig
 
 

@@ -146,7 +146,7 @@ def _design_job(plan: StudyPlan, number: int, drive: DriveSpec) -> DesignJob:
     machine = plan.design_machine(drive)
     name, problem = requests.choose_problem(machine, drive.problem, drive.duration_s)
     text = machine.model_dump_json(indent=1)
-    return DesignJob(number, text, name, problem, drive.objective, drive.starts, drive.seed)
+    return DesignJob(number, text, name, problem, drive.objective, drive.starts, drive.seed, plan.study.budget_s)
 
 
 def _run_design_jobs(job_list: list[DesignJob], cluster: str | None) -> Iterator[tuple[DesignJob, DesignOutcome]]:

@@ -107,7 +107,7 @@ def _run_steps(batch: RunBatch, seed: int) -> Row:
     row["log_sha256"] = hashlib.sha256(table.to_numpy(float).tobytes()).hexdigest()[:16]
     if steps & {"identify", "verify"}:
         estimate = identification.identify_table(known, table, batch.method)
-        arrays = (estimate.value, estimate.std, *estimate.interval95)
+        arrays = (estimate.value, estimate.std, *estimate.noise_interval95)
         row |= {name: _json_value(array.tolist()) for name, array in zip(ESTIMATE_COLUMNS, arrays, strict=True)}
         row["relative_error_percent"] = _json_value(estimate.relative_error_percent)
     if "diagnose" in steps:
@@ -152,6 +152,7 @@ class DesignJob:
     objective: str
     starts: int
     seed: int
+    budget_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -169,7 +170,7 @@ def design_drive(job: DesignJob) -> DesignOutcome:
 
 
 def _design_drive(job: DesignJob) -> DesignOutcome:
-    request = DesignRequest(job.objective, starts=job.starts, seed=job.seed)
+    request = DesignRequest(job.objective, starts=job.starts, seed=job.seed, budget_s=job.budget_s, other_end=False)
     try:
         model = build(
             Machine.model_validate_json(job.machine), fit_sensor_effects=False
@@ -181,7 +182,7 @@ def _design_drive(job: DesignJob) -> DesignOutcome:
         return DesignOutcome("", {}, design_request.singular_message(job.name))
     except Exception as err:
         return DesignOutcome("", {}, f"{DEFECT}: {type(err).__name__}: {_one_line(err)}")
-    if not result.design.complete:
+    if not result.design.complete and job.budget_s is None:
         raise KeyboardInterrupt
     if result.assumed_noise:  # runs of a study are simulated with the machine file's noise
         return DesignOutcome("", {}, f"the machine file gives no noise of {', '.join(result.assumed_noise)}: add it")

@@ -9,110 +9,101 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
 
 from excite import identification
 from excite.errors import MachineError
 from excite.identification import Estimate
 from excite.model import Model, build, standard_parameters
-from excite.model.machine import Machine
+from excite.model.machine import Machine, error_line
+from excite.model.mechanics import round_angle
+from excite.workflows import urdf_file
+from excite.workflows.urdf_file import Joint, Urdf
 
-MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
-PARALLEL = 1e-9  # sine of the angle and distance [m] below which two axes count as parallel, or meet
-ROUND_DIGITS = 12  # of numbers in the file; below them are errors of rounding
+PARALLEL = 1e-4  # sine of the angle below which two axes count as parallel: the digits that files give
+RESIDUE = 1e-9  # [m], and of the size of an inertia, below which a number is an error of rounding
+DIGITS = 12  # significant ones of numbers in the file
 NEAR_ZERO = 0.1  # of the typical size with its unit, below which a parameter gets that size as scale; chosen
 SAME_ROW = 1e-6  # rad, m, by which lengths and angles of a machine may differ from the URDF's; chosen
-ASSUMED_INERTIA = 0.01  # kg m2, of a link without inertia; assumed
+ASSUMED_FRICTION = 1.0  # N m, N m s and so on, of a joint without; assumed
+FRICTION_SHARE = 0.1  # of the joint's largest torque, at most, that is assumed as friction
 SAMPLING_HZ, CUTOFF_HZ, DECIMATION, SMOOTHING = 100, 5, 5, 0.01  # of the machine file to start from; assumed
 SIZES = {"kg": 1.0, "kg m": 0.1, "kg m2": 0.01}  # at least, of parameters near zero; assumed
+MOST_JOINTS = 30  # of a robot that becomes a machine: the equations of more take minutes
 
 
 @dataclass(frozen=True)
 class JointFrame:
     """A moving joint of a URDF.
 
-    name, kind; link: of the child. antecedent: index of the moving joint before it, None for the ground.
-    row: its modified Denavit-Hartenberg parameters. placement (4, 4): of the child link's frame in the joint's frame.
+    antecedent: index of the moving joint before it, None for the ground. row: its modified Denavit-Hartenberg
+    parameters. placement (4, 4): of the child link's frame in the joint's frame.
     """
 
-    name: str
-    kind: str
-    link: str
+    joint: Joint
     antecedent: int | None
     row: dict[str, float]
     placement: np.ndarray
-    joint: Any
 
 
 @dataclass(frozen=True)
 class Robot:
     """Moving joints of a URDF, and the links rigidly attached to each with their placement (4, 4) in its frame."""
 
-    name: str
+    urdf: Urdf
     joints: tuple[JointFrame, ...]
-    attached: tuple[tuple[tuple[Any, np.ndarray], ...], ...]
-    mimics: tuple[str, ...]
+    attached: tuple[tuple[tuple[str, np.ndarray], ...], ...]
+
+    @property
+    def leaders(self) -> tuple[int | None, ...]:
+        """Index of the joint that each one mimics, None for one that moves on its own."""
+        names = [frame.joint.name for frame in self.joints]
+        return tuple(None if f.joint.mimic is None else names.index(f.joint.mimic.joint) for f in self.joints)
+
+    def massless(self, k: int) -> bool:
+        """True if no link behind joint k has a mass."""
+        found = (self.urdf.links[link] for link, _ in self.attached[k])
+        return not any(given.mass for given in found if given is not None)
 
 
-def read_urdf(path: Path) -> Robot:
-    """Read the joints of a URDF in the order of their tree.
+def read_robot(path: Path) -> Robot:
+    """Read the moving joints of a URDF in the order of their tree.
 
     Raises MachineError for a file that is no URDF, has no moving joint, or a joint of another type.
     """
-    try:
-        import yourdfpy
-        from lxml import etree
-    except ImportError:
-        raise MachineError(f"{path}: URDF needs the extra `urdf`: pip install 'excite[urdf]'") from None
-    try:
-        root = etree.parse(str(path)).getroot().tag
-    except (OSError, etree.XMLSyntaxError) as err:
-        raise MachineError(f"{path}: can't be read as URDF: {' '.join(str(err).split())}") from None
-    if root != "robot":
-        raise MachineError(f"{path}: no URDF: its root is <{root}>, not <robot>; xacro must be expanded first")
-    try:
-        urdf = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False)
-    except Exception as err:  # whatever the parser of URDF raises
-        raise MachineError(f"{path}: can't be read as URDF: {' '.join(str(err).split())}") from None
-    robot = urdf.robot
-    children = {j.child for j in robot.joints}
-    roots = [link for link in robot.links if link.name not in children]
-    if len(roots) != 1:
-        raise MachineError(f"{path}: has {len(roots)} links without a joint above them, a robot has one, its base")
-    links = {link.name: link for link in robot.links}
+    urdf = urdf_file.read(path)
     joints: list[JointFrame] = []
-    attached: list[list[tuple[Any, np.ndarray]]] = []
-    waiting: list[tuple[str, int | None, np.ndarray]] = [(roots[0].name, None, np.eye(4))]
-    while waiting:
-        link, carrier, placement = waiting.pop(0)
-        for joint in (j for j in robot.joints if j.parent == link):
-            at = placement @ (np.eye(4) if joint.origin is None else joint.origin)
-            if joint.type == "fixed":
-                if carrier is not None:
-                    attached[carrier].append((links[joint.child], at))
-                waiting.append((joint.child, carrier, at))
-                continue
-            if joint.type not in MOVING:
-                raise MachineError(
-                    f"{path}: joint {joint.name}: type {joint.type} has no place in a machine file, allowed: fixed,"
-                    f" {', '.join(MOVING)}"
-                )
-            axis = np.array([1.0, 0.0, 0.0]) if joint.axis is None else np.asarray(joint.axis, float)
-            row, frame = _common_normal(at[:3, :3] @ axis / np.linalg.norm(axis), at[:3, 3])
-            own = np.linalg.inv(frame) @ at
-            index = len(joints)
-            joints.append(JointFrame(joint.name, MOVING[joint.type], joint.child, carrier, row, own, joint))
-            attached.append([(links[joint.child], own)])
-            waiting.append((joint.child, index, own))
+    attached: list[list[tuple[str, np.ndarray]]] = []
+    place: dict[str, tuple[int | None, np.ndarray]] = {urdf.base: (None, np.eye(4))}
+    for joint in urdf.joints:
+        carrier, placement = place[joint.parent]
+        at = placement @ joint.placement
+        if joint.kind == "fixed":
+            if carrier is not None:
+                attached[carrier].append((joint.child, at))
+            place[joint.child] = carrier, at
+            continue
+        row, frame = _common_normal(at[:3, :3] @ joint.axis, at[:3, 3])
+        own = np.linalg.inv(frame) @ at
+        place[joint.child] = len(joints), own
+        joints.append(JointFrame(joint, carrier, row, own))
+        attached.append([(joint.child, own)])
     if not joints:
         raise MachineError(f"{path}: no joint moves, so there is nothing to identify")
-    mimics = tuple(j.name for j in joints if j.joint.mimic is not None)
-    return Robot(robot.name or path.stem, tuple(joints), tuple(tuple(a) for a in attached), mimics)
+    if len(joints) > MOST_JOINTS:
+        raise MachineError(
+            f"{path}: has {len(joints)} moving joints, at most {MOST_JOINTS} can be identified at once: fix those that"
+            ' stand still (type="fixed")'
+        )
+    return Robot(urdf, tuple(joints), tuple(tuple(a) for a in attached))
 
 
 def _common_normal(axis: np.ndarray, point: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
@@ -124,37 +115,37 @@ def _common_normal(axis: np.ndarray, point: np.ndarray) -> tuple[dict[str, float
     normal = np.cross(z, axis)
     sine = float(np.linalg.norm(normal))
     if sine < PARALLEL:
-        b, foot = float(point[2]), point
-        across = point - b * z
-        d = float(np.linalg.norm(across))
-        x = across / d if d > PARALLEL else np.array([1.0, 0.0, 0.0])
+        b, d = float(point[2]), math.hypot(point[0], point[1])
+        gamma = math.atan2(point[1], point[0]) if d > RESIDUE else 0.0
+        alpha = 0.0 if axis[2] > 0 else math.pi
     else:
         x = normal / sine
         d = float(point @ x)
         # b z + d x = point + s axis
-        b, s = np.linalg.lstsq(np.column_stack([z, -axis]), point - d * x, rcond=None)[0]
-        foot = point + s * axis
-    alpha = math.atan2(float(np.cross(z, axis) @ x), float(axis[2]))
+        b = float(np.linalg.lstsq(np.column_stack([z, -axis]), point - d * x, rcond=None)[0][0])
+        gamma, alpha = math.atan2(x[1], x[0]), math.atan2(sine, float(axis[2]))
+    lengths = {"b": b, "d": d}
+    row = {"gamma": round_angle(gamma), "alpha": round_angle(alpha)}
+    row |= {key: 0.0 if abs(value) < RESIDUE else value for key, value in lengths.items()}
     frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = np.column_stack([x, np.cross(axis, x), axis]), foot
-    return {"gamma": math.atan2(x[1], x[0]), "b": float(b), "alpha": alpha, "d": d}, frame
+    frame[:3, :3] = Rotation.from_euler("ZX", [row["gamma"], row["alpha"]]).as_matrix()
+    frame[:3, 3] = frame[:3, 0] * row["d"] + z * row["b"]
+    return {key: row[key] for key in ("gamma", "b", "alpha", "d")}, frame
 
 
-def _whole_inertia(links: Sequence[tuple[Any, np.ndarray]]) -> tuple[float, np.ndarray, np.ndarray] | None:
-    """Return mass, centre of mass (3,) and inertia (3, 3) about it of links together, None if none has a mass."""
+def _whole_inertia(robot: Robot, k: int) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return mass, centre of mass (3,) and inertia (3, 3) about it of the links behind joint k, zeros without one."""
     parts = []
-    for link, at in links:
-        given = link.inertial
-        if given is None or not given.mass:
-            continue
-        place = at @ (np.eye(4) if given.origin is None else given.origin)
-        R = place[:3, :3]
-        J = np.zeros((3, 3)) if given.inertia is None else np.asarray(given.inertia, float)
-        parts.append((float(given.mass), place[:3, 3], R @ J @ R.T))
+    for link, at in robot.attached[k]:
+        given = robot.urdf.links[link]
+        if given is not None:
+            place = at @ given.placement
+            R = place[:3, :3]
+            parts.append((given.mass, place[:3, 3], R @ given.inertia @ R.T))
     if not parts:
-        return None
+        return 0.0, np.zeros(3), np.zeros((3, 3))
     mass = sum(m for m, _, _ in parts)
-    centre = np.asarray(sum(m * c for m, c, _ in parts)) / mass
+    centre = sum((m * c for m, c, _ in parts), np.zeros(3)) / (mass or 1.0)
     J = np.zeros((3, 3))
     for m, c, own in parts:
         r = c - centre
@@ -162,91 +153,99 @@ def _whole_inertia(links: Sequence[tuple[Any, np.ndarray]]) -> tuple[float, np.n
     return mass, centre, J
 
 
-def machine_from_urdf(path: Path, name: str) -> dict[str, Any]:
-    """Return the tables of a machine file for a robot: geometry, inertia, limits and friction of the URDF.
+def machine_from_urdf(path: Path, name: str) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return the tables of a machine file for a robot, and notes on what was read otherwise than it is written.
 
-    What it does not give is assumed and says so. Raises MachineError.
+    Geometry, inertia, limits and friction are those of the URDF; what it does not give is assumed and says so. A joint
+    that mimics another moves with it. Raises MachineError.
     """
-    robot = read_urdf(path)
+    robot = read_robot(path)
     names = body_names(robot)
+    notes = list(robot.urdf.notes)
     machine: dict[str, Any] = {
         "name": name,
-        "title": robot.name,
+        "title": robot.urdf.name,
         "reference": f"from {path.name}",
         "sampling_hz": _assumed(SAMPLING_HZ),
         "gravity": [0.0, 0.0, -9.81],
+        "body": [_body(robot, k, names[k]) for k in range(len(robot.joints))],
+        "sensor": [],
     }
-    if robot.mimics:
-        machine["locked"] = [
-            f"{'theta' if j.kind == 'revolute' else 'q'}{k + 1}"
-            for k, j in enumerate(robot.joints)
-            if j.name in robot.mimics
-        ]
-    machine["body"] = [_body(robot, k, names[k]) for k in range(len(robot.joints))]
-    machine["sensor"] = []
-    for k, j in enumerate(robot.joints):
-        turns = j.kind == "revolute"
+    for k, (frame, leader) in enumerate(zip(robot.joints, robot.leaders, strict=True)):
+        joint, turns = frame.joint, frame.joint.kind == "revolute"
+        if robot.massless(k):
+            notes.append(f"link {joint.child}: has no mass in the URDF, so it has none here: mass 0")
+        if leader is not None and joint.mimic is not None:
+            notes.append(
+                f"joint {joint.name}: moves with {joint.mimic.joint}: multiplier {joint.mimic.multiplier:g}, offset"
+                f" {joint.mimic.offset:g}; it has no sensors of its own"
+            )
+            continue
         common = {"body": k + 1}
-        angle = {"name": f"q{k + 1}", "kind": "angle", "column": f"{j.name}_{'rad' if turns else 'm'}"}
-        torque = {"name": f"u{k + 1}", "kind": "torque", "column": f"{j.name}_{'Nm' if turns else 'N'}"}
+        angle = {"name": f"q{k + 1}", "kind": "angle", "column": f"{joint.name}_{'rad' if turns else 'm'}"}
+        torque = {"name": f"u{k + 1}", "kind": "torque", "column": f"{joint.name}_{'Nm' if turns else 'N'}"}
         machine["sensor"].append(angle | common | {"unit": "rad" if turns else "m"})
         machine["sensor"].append(torque | common | {"unit": "N m" if turns else "N"})
     cutoff = {"source": "assumed", "cutoff_hz": _assumed(CUTOFF_HZ), "decimation": DECIMATION}
     machine["filter"] = cutoff
-    machine["scale"] = _scales(machine)
-    return machine
+    try:
+        machine["scale"] = _scales(machine)
+    except ValidationError as err:
+        raise MachineError(f"{error_line(path, err, Machine)}: as the URDF gives it") from None
+    return machine, tuple(notes)
 
 
 def body_names(robot: Robot) -> list[str]:
     """Return a name for the body behind each joint that a machine file allows: the link's, in small letters."""
     found: list[str] = []
-    for k, joint in enumerate(robot.joints):
-        plain = re.sub(r"[^a-z0-9_]+", "_", joint.link.lower()).strip("_")
+    for k, frame in enumerate(robot.joints):
+        plain = re.sub(r"[^a-z0-9_]+", "_", frame.joint.child.lower()).strip("_")
         plain = plain if plain[:1].isalpha() else f"link_{plain}".rstrip("_")
-        found.append(plain if plain not in found else f"{plain}_{k + 1}")
+        while plain in found:
+            plain = f"{plain}_{k + 1}"
+        found.append(plain)
     return found
 
 
 def _body(robot: Robot, k: int, name: str) -> dict[str, Any]:
     """Return the table of the body behind joint k."""
-    frame = robot.joints[k]
-    given = frame.joint
+    frame, leader = robot.joints[k], robot.leaders[k]
+    joint = frame.joint
     body: dict[str, Any] = {
         "index": k + 1,
         "name": name,
         "antecedent": "ground" if frame.antecedent is None else frame.antecedent + 1,
-        "joint": frame.kind,
-        "actuated": True,
+        "joint": joint.kind,
     }
+    if leader is None or joint.mimic is None:
+        body["actuated"] = True
+    else:
+        ratio = {"joint": leader + 1, "ratio": _given(joint.mimic.multiplier)}
+        body["moves_with"] = ratio | ({"offset": _given(joint.mimic.offset)} if joint.mimic.offset else {})
     body |= {key: _given(value) for key, value in frame.row.items()}
-    whole = _whole_inertia(robot.attached[k])
-    said = "published"
-    if whole is None:
-        whole, said = (1.0, np.full(3, 0.05), ASSUMED_INERTIA * np.eye(3)), "assumed"
-    mass, centre, J = whole
+    mass, centre, J = _whole_inertia(robot, k)
+    said = {"note": "the URDF gives no mass"} if robot.massless(k) else {}
     axes = {"XX": (0, 0), "XY": (0, 1), "XZ": (0, 2), "YY": (1, 1), "YZ": (1, 2), "ZZ": (2, 2)}
+    size = float(np.trace(J)) + mass * float(centre @ centre)
     body["inertia"] = {
-        "mass": {"value": mass, "source": said},
-        "com": {"value": [_rounded(x) for x in centre], "source": said},
-        **{key: {"value": _rounded(J[ij]), "source": said} for key, ij in axes.items()},
+        "mass": _given(mass) | said,
+        "com": {"value": [_rounded(x, RESIDUE) for x in centre], "source": "published"},
+        **{key: _given(_rounded(J[ij], RESIDUE * size)) for key, ij in axes.items()},
     }
-    dynamics = given.dynamics
-    damping, friction = (getattr(dynamics, key, None) for key in ("damping", "friction"))
-    body["friction"] = {
-        "Fv": _given(damping) if damping else _assumed(1.0),
-        "Fs": _given(friction) if friction else _assumed(1.0),
-        "u0": _assumed(0.0),
-        "smoothing": _assumed(SMOOTHING),
-    }
-    limit = given.limit
-    if limit is not None:
-        body["limit"] = {
-            key: _given(value) for key, value in (("torque", limit.effort), ("rate", limit.velocity)) if value
+    if leader is None or joint.damping or joint.friction:
+        usual = min(ASSUMED_FRICTION, FRICTION_SHARE * (joint.effort or math.inf))
+        body["friction"] = {
+            "Fv": _given(joint.damping) if joint.damping else _assumed(usual),
+            "Fs": _given(joint.friction) if joint.friction else _assumed(usual),
+            "u0": _assumed(0.0),
+            "smoothing": _assumed(SMOOTHING),
         }
-        low, high = limit.lower or 0.0, limit.upper or 0.0
-        if given.type != "continuous" and low < high:
-            ends = {"position": high} if low == -high else {"position_low": low, "position_high": high}
-            body["limit"] |= {key: _given(value) for key, value in ends.items()}
+    limits = {"torque": None if leader is not None else joint.effort, "rate": joint.velocity}
+    body["limit"] = {key: _given(value) for key, value in limits.items() if value}
+    if joint.low is not None and joint.high is not None:
+        low, high = joint.low, joint.high
+        ends = {"position": high} if low == -high else {"position_low": low, "position_high": high}
+        body["limit"] |= {key: _given(value) for key, value in ends.items()}
     return body
 
 
@@ -269,51 +268,52 @@ def urdf_with_estimate(path: Path, model: Model, estimate: Estimate) -> tuple[st
     """Return the text of a URDF with identified inertia and friction, and notes on what has no place in it.
 
     model: of the machine file from this URDF. Each moving link gets the inertia of all links attached to it, which lose
-    theirs. The bodies are the possible ones nearest to the machine file with the identified base parameters, see
-    `possible_standard`. Raises MachineError for another robot's URDF, NotConsistentError.
+    theirs. The bodies are those of `possible_standard`; a note says how far off they are if no possible ones have the
+    identified base parameters. Raises MachineError for another robot's URDF, NotConsistentError.
     """
-    robot = read_urdf(path)
-    from lxml import etree
-
+    robot = read_robot(path)
     machine = model.machine
     if machine.in_ratios:
         raise MachineError(
             f"{machine.name}: its values are divided by an unknown torque constant, URDF needs SI values"
         )
     _check_same(path, robot, machine)
-    p = identification.possible_standard(model, estimate)
-    tree = etree.parse(str(path))
-    links = {link.get("name"): link for link in tree.getroot().findall("link")}
-    joints = {joint.get("name"): joint for joint in tree.getroot().findall("joint")}
+    p, far = identification.possible_standard(model, estimate)
+    root = urdf_file.parse(path)
+    links = {link.get("name"): link for link in root.findall("link")}
+    joints = {joint.get("name"): joint for joint in root.findall("joint")}
     for k, (frame, attached) in enumerate(zip(robot.joints, robot.attached, strict=True), start=1):
         for link, _ in attached:
-            for old in links[link.name].findall("inertial"):
-                links[link.name].remove(old)
+            for old in links[link].findall("inertial"):
+                links[link].remove(old)
         mass, centre, J = _about_centre(p, k)
         R, t = frame.placement[:3, :3], frame.placement[:3, 3]
         centre, J = R.T @ (centre - t), R.T @ J @ R
-        inertial = etree.SubElement(links[frame.link], "inertial")
-        etree.SubElement(inertial, "origin", xyz=" ".join(f"{x:.12g}" for x in centre), rpy="0 0 0")
-        etree.SubElement(inertial, "mass", value=f"{mass:.12g}")
+        inertial = ElementTree.SubElement(links[frame.joint.child], "inertial")
+        ElementTree.SubElement(inertial, "origin", xyz=" ".join(f"{x:.15g}" for x in centre), rpy="0 0 0")
+        ElementTree.SubElement(inertial, "mass", value=f"{mass:.15g}")
         axes = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-        etree.SubElement(inertial, "inertia", **{key: f"{J[ij]:.12g}" for key, ij in axes.items()})
-        joint = joints[frame.name]
-        dynamics = joint.find("dynamics")
-        dynamics = etree.SubElement(joint, "dynamics") if dynamics is None else dynamics
-        dynamics.set("damping", f"{p[f'Fv{k}']:.12g}")
-        dynamics.set("friction", f"{p[f'Fs{k}']:.12g}")
-    etree.indent(tree)
+        ElementTree.SubElement(inertial, "inertia", {key: f"{J[ij]:.15g}" for key, ij in axes.items()})
+        if f"Fv{k}" in p:
+            joint = joints[frame.joint.name]
+            dynamics = joint.find("dynamics")
+            dynamics = ElementTree.SubElement(joint, "dynamics") if dynamics is None else dynamics
+            dynamics.set("damping", f"{p[f'Fv{k}']:.12g}")
+            dynamics.set("friction", f"{p[f'Fs{k}']:.12g}")
+    ElementTree.indent(root)
     lost = [(b.where, what) for b in machine.body for what in ("drive", "spring") if getattr(b, what) is not None]
     said = {"drive": "rotor inertia", "spring": "spring"}
     notes = [f"{where}: a URDF has no place for its {said[what]}, which is left out" for where, what in lost]
-    return etree.tostring(tree, encoding="unicode", pretty_print=True), notes
+    if far is not None:
+        notes.append(far)
+    return ElementTree.tostring(root, encoding="unicode") + "\n", notes
 
 
 def _check_same(path: Path, robot: Robot, machine: Machine) -> None:
     """Raise MachineError unless the machine's joints are those of the URDF."""
     same = len(machine.body) == len(robot.joints)
     for body, name, frame in zip(machine.body, body_names(robot), robot.joints, strict=False):
-        same &= body.name == name and body.joint == frame.kind and body.inertia is not None
+        same &= body.name == name and body.joint == frame.joint.kind and body.inertia is not None
         same &= all(abs(float(getattr(body, key)) - value) < SAME_ROW for key, value in frame.row.items())
     if not same:
         raise MachineError(
@@ -329,8 +329,9 @@ def _about_centre(p: Mapping[str, float], k: int) -> tuple[float, np.ndarray, np
     return M, c, J - M * (float(c @ c) * np.eye(3) - np.outer(c, c))
 
 
-def _rounded(value: float) -> float:
-    return round(float(value), ROUND_DIGITS) + 0.0
+def _rounded(value: float, residue: float = 1e-12) -> float:
+    """Round a number to DIGITS, to zero below a residue; the least that a machine file takes is 1e-12."""
+    return 0.0 if abs(value) < max(residue, 1e-12) else float(f"{value:.{DIGITS}g}")
 
 
 def _given(value: float) -> dict[str, Any]:

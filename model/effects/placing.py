@@ -177,7 +177,8 @@ def place_effect(machine: Machine, entry: EffectEntry, duration: float = DEFAULT
         if name not in effect.shapes:
             options = ", ".join(effect.shapes) or "none"
             raise MachineError(f"{machine.name}: effect {entry.name}: no shape {name}, allowed: {options}")
-    if effect.positive and not float(entry.amount) > 0:
+    is_error = not isinstance(entry.amount.known, bool)  # of the file, about zero
+    if effect.positive and not float(entry.amount) > 0 and not is_error:
         raise MachineError(f"{machine.name}: effect {entry.name}: amount must be > 0 (got {float(entry.amount):g})")
     bodies, sensors = allowed[where]
     if effect.sensor_only and not sensors:

@@ -14,6 +14,7 @@ from .machine import (
     Problem as Problem,
     Sensor as Sensor,
     Spring as Spring,
+    Tolerances as Tolerances,
     load_machine as load_machine,
     machine_files as machine_files,
     machine_tables as machine_tables,
@@ -21,6 +22,7 @@ from .machine import (
     shipped_machines as shipped_machines,
 )
 from .meanings import MEANINGS as MEANINGS
+from .noise import noise_of as noise_of, si_per_number as si_per_number
 from .places import key_lines as key_lines, named as named
 from .records import (
     FileRecord as FileRecord,
@@ -30,7 +32,9 @@ from .records import (
     error_lines as error_lines,
     read_toml as read_toml,
 )
+from .surroundings import Box as Box, Plane as Plane, Shape as Shape, Tool as Tool, World as World
 from .units import (
+    DRIVEN_BY as DRIVEN_BY,
     PER_FORCE_CONSTANT as PER_FORCE_CONSTANT,
     PER_TORQUE_CONSTANT as PER_TORQUE_CONSTANT,
     TURN as TURN,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -79,6 +80,9 @@ def _override(
             f"{path}: sensor: a list replaces that of {parent}, so every sensor needs all its keys;"
             " [sensor.NAME] changes one, `excite machine new NAME --like` writes all"
         )
+    if whole.get("noise_unit") == "SI":  # of the file that is extended
+        whole["sensor"] = [{"noise_unit": "SI"} | x if isinstance(x, dict) else x for x in listed]
+        whole.pop("noise_unit")
     for key in LISTS:
         if isinstance(raw.get(key), dict) and isinstance(whole.get(key), list):
             raw[key] = _change_named(path, key, whole[key], raw[key], wrong)
@@ -91,14 +95,25 @@ def _change_named(path: Path, key: str, known: list[Any], changes: dict[str, Any
     meant: dict[str, Any] = {}
     for name, change in changes.items():
         if not isinstance(change, dict):
-            raise ValueError(f"{path}: {key}.{name}: must be a table of the keys that differ (got {change!r})")
+            raise ValueError(
+                f"{path}: {key}.{name}: must be a table of the keys that differ (got {reprlib.repr(change)})"
+            )
         if name not in names:
             hint = did_you_mean(name, names)
             wrong.append(WrongName(path, (key, name), f"no such {key}, allowed: {', '.join(names)}{hint}"))
         one = name if name in names else closest(name, names)
         if one is not None:
             meant[one] = _merge(meant.get(one, {}), change)
-    return [_merge(x, meant[n]) if n in meant else x for n, x in zip(names, known, strict=True)]
+    merged = [_merge(x, meant[n]) if n in meant else x for n, x in zip(names, known, strict=True)]
+    return [_in_own_unit(x, meant.get(n, {}), m) for n, x, m in zip(names, known, merged, strict=True)]
+
+
+def _in_own_unit(base: Any, change: dict[str, Any], merged: Any) -> Any:
+    """Keep the unit of a noise that a sensor inherits, where its column gets another one."""
+    renewed = {"unit", "factor"} & change.keys()
+    if not isinstance(base, dict) or not renewed or {"noise", "noise_unit"} & change.keys() or "noise" not in base:
+        return merged
+    return merged | {"noise_unit": base.get("noise_unit", base.get("unit"))}
 
 
 def _merge(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:

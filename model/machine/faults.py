@@ -15,7 +15,7 @@ from pydantic_core import ErrorDetails
 from excite.model.machine.extends import WrongName
 from excite.model.machine.machine import Machine
 from excite.model.machine.places import Path, key_lines, line_of, named
-from excite.model.machine.records import error_text, record_at
+from excite.model.machine.records import MOST_SAID, error_text, record_at
 from excite.text import closest
 
 ROUNDS = 10  # of putting right and reading again; chosen
@@ -56,6 +56,9 @@ def find_faults(
             return FileFaults(tuple(found), Machine.model_validate(raw), complete)
         except ValidationError as err:
             errors = err.errors(include_url=False)
+        if len(errors) > MOST_SAID:
+            lines_said = [_line(*_located(one), raw, lines) for one in errors[:MOST_SAID]]
+            return FileFaults((*found, *lines_said, f"{len(errors) - MOST_SAID} more faults"), None, False)
         meant = {(*e["loc"][:-1], _meant(e)) for e in errors if e["type"] == "extra_forbidden"}
         dropped: set[int] = set()
         mended = False
@@ -151,9 +154,10 @@ def _mend(raw: dict[str, Any], one: ErrorDetails, where: Path) -> bool:
     if kind == "model_type" and isinstance(value, int | float) and not isinstance(value, bool):
         parent[key] = {"value": value, "source": "assumed"}  # type: ignore[index]
         return True
-    number = value.get("value") if isinstance(value, dict) else None
+    quantity = _at(raw, where)  # which a message of its record may name
+    number = quantity.get("value") if isinstance(quantity, dict) else None
     if kind == "value_error" and SIGNS.search(one["msg"]) and isinstance(number, int | float) and number:
-        value["value"] = -number
+        quantity["value"] = -number
         return True
     return kind == "value_error" and where == ("problem",) and raw.pop("problem", None) is not None
 

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
 from excite.errors import MachineError
-from excite.model.machine import extends, hydraulics, units
+from excite.model.machine import extends, hydraulics, noise, units
 from excite.model.machine.force_loop import ForceLoop
 from excite.model.machine.records import (
     BodyPoint,
@@ -31,6 +31,7 @@ from excite.model.machine.records import (
     Vector3,
     error_line,
 )
+from excite.model.machine.surroundings import Shape, Tool, World
 from excite.text import did_you_mean
 
 MACHINES = Path(__file__).parents[1] / "machines"
@@ -62,6 +63,9 @@ LOG_CHECKS = {
 }
 
 
+Size = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
 def _zero() -> Quantity:
     """Return the default of an optional entry."""
     return Quantity(value=0.0, source="definition")
@@ -70,11 +74,12 @@ def _zero() -> Quantity:
 class Inertia(FileRecord):
     """Mass [kg], centre of mass [m] in the body's frame and inertia [kg m2] about the centre of mass.
 
+    A mass of 0, as of a link that a URDF gives none, needs a `note` that says why.
     `axisymmetric`: a roll or wheel, balanced about its joint axis z with its centre of mass at the frame's origin;
     its standard parameters are then M, XX (= YY) and ZZ only.
     """
 
-    mass: Positive
+    mass: Quantity
     com: BodyPoint = BodyPoint(value=(0.0, 0.0, 0.0), source="definition")
     XX: NotNegative = Field(default_factory=_zero)
     XY: Quantity = Field(default_factory=_zero)
@@ -86,6 +91,9 @@ class Inertia(FileRecord):
 
     @model_validator(mode="after")
     def _consistent(self) -> Inertia:
+        if self.mass.value < 0 or (not self.mass.value and not self.mass.note):
+            hint = "" if self.mass.value else "; a body without mass needs a note that says why"
+            raise ValueError(f"mass: must be > 0 (got {self.mass.value:g}){hint}")
         if self.axisymmetric:
             if any(self.com.value):
                 raise ValueError("com: of an axisymmetric body is at its frame's origin, leave it out")
@@ -116,10 +124,14 @@ def _one() -> Quantity:
 
 
 class Coupling(FileRecord):
-    """A joint that another one takes along. `ratio`: angle (`moves_with`) or torque (`driven_with`) per that of it."""
+    """A joint that another one takes along. `ratio`: angle (`moves_with`) or torque (`driven_with`) per that of it.
+
+    offset [rad, m]: angle where that of the other one is 0 (`moves_with`), as of a URDF's <mimic>.
+    """
 
     joint: Index
     ratio: Quantity = Field(default_factory=_one)
+    offset: Quantity = Field(default_factory=_zero)
 
     @model_validator(mode="after")
     def _consistent(self) -> Coupling:
@@ -132,9 +144,13 @@ class Drive(FileRecord):
     """Inertia of a joint's geared rotor as seen at the joint: (gear ratio)^2 x that of the rotor [kg m2, kg].
 
     It adds rotor_inertia q" to the joint's own equation; what the spinning rotor does to other joints is left out.
+
+    turns_with: the rotor turns by the angle of its own joint plus a ratio times that of another one, as where a wrist's
+    last motor sits before the joint that carries it. Its torque and inertia then act on both joints.
     """
 
     rotor_inertia: Positive
+    turns_with: Coupling | None = None
 
 
 class Spring(FileRecord):
@@ -179,7 +195,8 @@ class Contact(FileRecord):
 class JointLimit(FileRecord):
     """Limits of a joint's drive. `rim_speed` is |radius x rate| of a contact [m/s].
 
-    `position`: largest angle or stroke either way; `position_low` and `position_high` where the two differ.
+    `position`: largest angle or stroke either way; `position_low` and `position_high` where the two differ;
+    `position_margin`: what a drive keeps free of either end. `acceleration`, `jerk`: of a motion that is planned.
     """
 
     torque: Positive | None = None
@@ -187,7 +204,10 @@ class JointLimit(FileRecord):
     position: Positive | None = None
     position_low: Quantity | None = None
     position_high: Quantity | None = None
+    position_margin: NotNegative | None = None
     rate: Positive | None = None
+    acceleration: Positive | None = None
+    jerk: Positive | None = None
     rim_speed: Positive | None = None
 
     @property
@@ -196,6 +216,12 @@ class JointLimit(FileRecord):
         if self.position_low is not None and self.position_high is not None:
             return float(self.position_low), float(self.position_high)
         return None if self.position is None else (-float(self.position), float(self.position))
+
+    @property
+    def drive_range(self) -> tuple[float, float] | None:
+        """Lowest and highest position [rad, m] of a drive, with `position_margin` free; None without a limit."""
+        ends, margin = self.position_range, float(self.position_margin or 0.0)
+        return None if ends is None else (ends[0] + margin, ends[1] - margin)
 
     @property
     def reach(self) -> float | None:
@@ -212,6 +238,9 @@ class JointLimit(FileRecord):
                 raise ValueError("position: is the same both ways; leave it out beside position_low, position_high")
             if float(low) >= float(high):
                 raise ValueError(f"position_low: must be below position_high (got {float(low):g}, {float(high):g})")
+        ends = self.drive_range
+        if self.position_margin is not None and (ends is None or ends[0] >= ends[1]):
+            raise ValueError("position_margin: needs a range of positions that is wider than it on both sides")
         return self
 
 
@@ -253,6 +282,7 @@ class Body(FileRecord):
     drive: Drive | None = None
     spring: Spring | None = None
     contact: Contact | None = None
+    shape: tuple[Shape, ...] = ()
     limit: JointLimit = JointLimit()
 
     @property
@@ -318,7 +348,12 @@ class Sensor(FileRecord):
     `x`, `y`: position on the ground, such as those of GNSS. All but angles and torques sit on the first chassis, at
     `ahead` and `lateral` [m] of its origin (a fifth wheel, an antenna).
 
-    Every sensor is in kit `full`. An angle given as a rate (rpm, deg/s) has the `noise` of a rate [rad/s].
+    Every sensor is in kit `full`.
+
+    noise: standard deviation of a sample in the unit of the column (bar, rpm, deg, A), of two pressures that of their
+    difference; `noise_unit` names another one, "SI" that of what the sensor measures (see `noise_of`).
+
+    sign_bit: bit of a register that holds its sign, the bits below hold the magnitude.
 
     A torque may be given as two pressures, in `column` and `return_column`: those of a hydraulic motor with its
     `displacement` [m3 per turn of the joint, gear included], u = displacement / (2 pi) (p - p_return), or those of
@@ -327,8 +362,11 @@ class Sensor(FileRecord):
     gear_ratio: turns of the motor per turn of the joint, of an encoder (`counts_per_turn` of the motor) or a current.
 
     A torque may be given as the current of its motor: u = `torque_constant` [N m/A at the motor] x `gear_ratio` x
-    current. Without the constant all torques must be such currents of motors of one kind; results are then divided by
-    that constant (`Machine.in_ratios`).
+    current. Without the constant all torques must be such currents, or all voltages or duty cycles, of motors of one
+    kind; results are then divided by that constant (`Machine.in_ratios`), and what the file calls known gives it.
+
+    A motor driven by a voltage has a `resistance` [ohm] beside its `torque_constant`: u = torque_constant x gear_ratio
+    x voltage / resistance, and its back-EMF is a damping (`back_emf_damping`).
 
     `loop`: the column holds the torque, force or current that the drive was commanded, and this loop delivers it.
 
@@ -341,6 +379,8 @@ class Sensor(FileRecord):
 
     `time_column`, `time_unit`: of a sensor that a logger with a clock of its own recorded; `time_offset` [s] is added
     to its times.
+
+    `time_tolerance` [s], `gain_tolerance` (a share): standard deviations to which its times and its gain are known.
     """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
@@ -352,6 +392,7 @@ class Sensor(FileRecord):
     return_column: Annotated[str | None, Field(min_length=1)] = None
     displacement: Positive | None = None
     torque_constant: Quantity | None = None
+    resistance: Positive | None = None
     gear_ratio: Quantity | None = None
     loop: ForceLoop | None = None
     zero: Annotated[Quantity | Literal["sought"] | None, WrapValidator(_sought_or_value)] = None
@@ -360,6 +401,8 @@ class Sensor(FileRecord):
     place: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
     counts_per_turn: Positive | None = None
     noise: NotNegative | None = None
+    noise_unit: str | None = None
+    sign_bit: Annotated[int | None, Field(strict=True, ge=1, le=62)] = None
     step: Positive | None = None
     rate_hz: Positive | None = None
     ahead: Quantity | None = None
@@ -371,6 +414,8 @@ class Sensor(FileRecord):
     time_column: Annotated[str | None, Field(min_length=1)] = None
     time_unit: TimeUnit | None = None
     time_offset: Annotated[float, Field(allow_inf_nan=False)] = 0.0
+    time_tolerance: Size | None = None
+    gain_tolerance: Size | None = None
 
     @property
     def resolution(self) -> float | None:
@@ -391,7 +436,8 @@ class Sensor(FileRecord):
         if self.displacement is not None:
             one *= float(self.displacement) / (2 * math.pi)
         gear = float(self.gear_ratio or 1.0)
-        return one / gear if self.kind == "angle" else one * float(self.torque_constant or 1.0) * gear
+        per_volt = 1.0 / float(self.resistance or 1.0)
+        return one / gear if self.kind == "angle" else one * float(self.torque_constant or 1.0) * gear * per_volt
 
     @property
     def shift(self) -> float:
@@ -404,10 +450,23 @@ class Sensor(FileRecord):
         return self.zero == "sought" or (isinstance(self.zero, Quantity) and not isinstance(self.zero.known, bool))
 
     @property
-    def is_bare_current(self) -> bool:
-        """True if the column holds a current without what makes it a torque."""
-        current = units.UNITS.get(self.unit, ("",))[0] == "current"
-        return current and self.factor is None and self.torque_constant is None
+    def driven_by(self) -> str | None:
+        """SI unit of the current, voltage or duty cycle that the column holds, None for a torque."""
+        motor = self.kind == "torque" and self.factor is None and self.return_column is None
+        return units.DRIVEN_BY.get(units.UNITS.get(self.unit, ("",))[0]) if motor else None
+
+    @property
+    def is_bare(self) -> bool:
+        """True if the column holds a current, voltage or duty cycle without what makes it a torque."""
+        return self.driven_by is not None and self.torque_constant is None
+
+    @property
+    def back_emf_damping(self) -> float:
+        """Damping of the joint [N m s] by the voltage that its turning motor makes, 0 unless a voltage drives it."""
+        if self.resistance is None:
+            return 0.0
+        constant = float(self.torque_constant or 0.0) * float(self.gear_ratio or 1.0)
+        return constant**2 / float(self.resistance)
 
     @property
     def is_rate(self) -> bool:
@@ -456,18 +515,28 @@ class Sensor(FileRecord):
             )
         for key in ("torque_constant", "gear_ratio"):
             given = getattr(self, key)
-            current = units.UNITS.get(self.unit, ("",))[0] == "current" and self.factor is None
-            if given is not None and not current and (self.kind, key) != ("angle", "gear_ratio"):
+            if given is not None and self.driven_by is None and (self.kind, key) != ("angle", "gear_ratio"):
                 also = ", or an angle of that of a motor" if key == "gear_ratio" else ""
-                raise ValueError(f"{key}: makes a torque of a current, unit A or mA without factor{also}")
+                raise ValueError(
+                    f"{key}: makes a torque of a current, voltage or duty cycle, unit A, mA, V, mV or % without"
+                    f" factor{also}"
+                )
             if given is not None and given.value == 0:
                 raise ValueError(f"{key}: must not be 0")
+        needs_resistance = self.driven_by in ("V", "1") and self.torque_constant is not None
+        if needs_resistance and (self.resistance is None or self.driven_by == "1"):
+            raise ValueError(
+                "torque_constant: of a motor driven by a voltage needs its resistance [ohm], and the column's unit V;"
+                " leave it out for values divided by the unknown torque per volt or duty cycle"
+            )
+        if self.resistance is not None and not needs_resistance:
+            raise ValueError("resistance: is for a motor driven by a voltage, unit V or mV, with its torque_constant")
         if self.loop is not None and (self.kind != "torque" or pressed):
             raise ValueError("loop: is for a commanded torque, force or current, kind torque without pressures")
         if self.loop is not None and self.noise is None:
             raise ValueError(
-                "noise: is missing beside loop: by how much [SI] the delivered torque or force differs from the"
-                " loop's response, which no log of commands shows"
+                f"noise: is missing beside loop: by how much [{self.unit}] the delivered torque or force differs"
+                " from the loop's response, which no log of commands shows"
             )
         if self.zero is not None and (self.kind != "angle" or self.is_rate):
             raise ValueError("zero: is for the position of a joint, kind angle without a rate's unit")
@@ -490,6 +559,8 @@ class Sensor(FileRecord):
             if name not in LOG_CHECKS:
                 hint = did_you_mean(name, LOG_CHECKS)
                 raise ValueError(f"checks_off: {name!r} is unknown, allowed: {', '.join(LOG_CHECKS)}{hint}")
+        if line := noise.wrong_noise_unit(self):
+            raise ValueError(line)
         if self.noise is not None and self.noise.value == 0 and self.counts_per_turn is None:
             raise ValueError("noise: must be > 0 (got 0); leave it out if it is unknown")
         if "full" not in self.kits:
@@ -516,8 +587,10 @@ class Problem(FileRecord):
 
     lane_m: length and width of the lane area, centred on 0, 0; lane_polygon_m: corners of a convex area, a second limit
     of the `lane_points`. All three are for machines on the plane. reversals: most reversals of the direction of travel.
-    rest: start and end at rest. start_pose, end_pose: positions of joints there, by coordinate; those that are not
-    given start at zero, or in the middle of a range without zero, and end where they start.
+    rest: start and end at rest. periodic: end as it starts, also in speed, acceleration and jerk, so that the drive can
+    be repeated without a stop; rest is then left out. start_pose, end_pose: positions of joints there, by coordinate;
+    those that are not given start at zero, or in the middle of a range without zero, and end where they start. An arm's
+    joints without either start where the search finds best.
     """
 
     source: Source
@@ -528,6 +601,7 @@ class Problem(FileRecord):
     lane_polygon_m: tuple[tuple[Number, Number], ...] = ()
     reversals: Annotated[int, Field(strict=True, ge=0)] | None = None
     rest: Flag = True
+    periodic: Flag = False
     start_pose: dict[str, Number] = Field(default={})
     end_pose: dict[str, Number] = Field(default={})
 
@@ -542,6 +616,10 @@ class Problem(FileRecord):
             raise ValueError(f"lane_m: must be > 0, length and width (got {min(self.lane_m):g})")
         if self.lane_polygon_m and not _convex(self.lane_polygon_m):
             raise ValueError("lane_polygon_m: must be three corners or more, in order, of a convex area")
+        if self.periodic and (self.rest or self.end_pose):
+            raise ValueError(
+                f"{'rest' if self.rest else 'end_pose'}: a periodic drive has no ends: rest = false, no end_pose"
+            )
         if self.knot_s.value * 4 > self.duration_s.value:
             least = 4 * self.knot_s.value
             raise ValueError(f"duration_s: must be at least 4 knots long, {least:g} s (got {self.duration_s.value:g})")
@@ -582,10 +660,27 @@ def _convex(corners: Sequence[tuple[float, float]]) -> bool:
     return n >= 3 and one_way and abs(abs(turn) - 2 * math.pi) < 1e-6
 
 
+class Tolerances(FileRecord):
+    """Standard deviations of what a machine file takes as exact, where the quantity has no `tolerance` of its own.
+
+    alignment [s]: of a torque channel with the motion, half a sampling period if not given. length [m]: of measured
+    lengths and positions. radius, gain: shares of the value. level [rad]: of the ground, a base or a speed sensor.
+    """
+
+    alignment: Size | None = None
+    length: Size = 0.003
+    radius: Size = 0.002
+    gain: Size = 0.01
+    level: Size = 0.002
+
+
 class Machine(FileRecord):
     """A machine file. `locked` coordinates are held at zero.
 
-    known: base parameters known beforehand, such as the whole machine's mass from a weighbridge.
+    known: base parameters known beforehand, such as the whole machine's mass from a weighbridge. noise_unit: "SI" in
+    files whose noise is in SI units, whatever the columns are in. blank_means: "unchanged" of a logger that writes a
+    cell only where its value changes. enabled_column: rows in which it is 0, false or blank are left out. stamps:
+    "arrival" of rows that were sampled evenly and stamped when they arrived.
     """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")]
@@ -594,6 +689,10 @@ class Machine(FileRecord):
     sampling_hz: Positive
     time_column: str = "t_s"
     time_unit: TimeUnit = "s"
+    noise_unit: Literal["column", "SI"] = "column"
+    blank_means: Literal["missing", "unchanged"] = "missing"
+    enabled_column: Annotated[str | None, Field(min_length=1)] = None
+    stamps: Literal["sampling", "arrival"] = "sampling"
     gravity: Vector3 = (0.0, 0.0, -9.81)
     power_limit: Positive | None = None
     locked: tuple[str, ...] = ()
@@ -605,7 +704,10 @@ class Machine(FileRecord):
     parameter_names: dict[str, str] = Field({})
     scale: dict[str, Positive] = Field({})
     known: dict[str, Quantity] = Field({})
+    tolerance: Tolerances = Field(default_factory=lambda: Tolerances())
     effect: tuple[EffectEntry, ...] = ()
+    world: World = World()
+    tool: Tool | None = None
 
     def find(self, index: int) -> Body:
         """Return the body with this index. Raises KeyError."""
@@ -651,14 +753,27 @@ class Machine(FileRecord):
         return (body, *(b for b in self.body if b.driven_with and b.driven_with.joint == body.index))
 
     def joint_values(self, body: Body, x: Any) -> Any:
-        """Return a joint's angle from coordinates x (n_q, ...), or its rate from velocities."""
+        """Return a joint's rate from velocities x (n_q, ...), or its angle from coordinates without an offset."""
         return self.ratio(body) * x[self.coordinates.index(self.coordinate(body))]
+
+    def joint_positions(self, body: Body, q: Any) -> Any:
+        """Return a joint's angle from coordinates q (n_q, ...)."""
+        return self.joint_values(body, q) + self.offset(body)
+
+    def turned_with(self, body: Body) -> tuple[Body, float] | None:
+        """Return the joint that turns a joint's rotor as well, and by which ratio; None without a free one."""
+        coupling = None if body.drive is None else body.drive.turns_with
+        if coupling is None or not self.is_free(self.find(coupling.joint)):
+            return None
+        return self.find(coupling.joint), float(coupling.ratio)
 
     @property
     def input_matrix(self) -> np.ndarray:
         """Matrix B (n_q, n_u): torques on the coordinates per torque of each drive, S^T of those on the joints."""
         B = np.zeros((len(self.coordinates), len(self.actuated)))
         for k, driven in enumerate(self.actuated):
+            if also := self.turned_with(driven):
+                B[self.coordinates.index(self.coordinate(also[0])), k] += also[1] * self.ratio(also[0])
             for b in self.drives(driven):
                 if self.is_free(b):
                     share = 1.0 if b.driven_with is None else float(b.driven_with.ratio)
@@ -687,6 +802,10 @@ class Machine(FileRecord):
         """Return a joint's angle per that of its `coordinate`."""
         return 1.0 if body.moves_with is None else float(body.moves_with.ratio)
 
+    def offset(self, body: Body) -> float:
+        """Return a joint's angle [rad, m] where its `coordinate` is 0."""
+        return 0.0 if body.moves_with is None else float(body.moves_with.offset)
+
     @property
     def sought_zeros(self) -> dict[str, Sensor]:
         """Encoders of free joints whose zero is sought, by name of the parameter: q10 of joint 1."""
@@ -706,7 +825,12 @@ class Machine(FileRecord):
     @property
     def in_ratios(self) -> bool:
         """True if torques are known up to the motors' torque constant only; values then are divided by it."""
-        return any(s.is_bare_current for s in self.sensor)
+        return any(s.is_bare for s in self.sensor)
+
+    @property
+    def torque_unit(self) -> str | None:
+        """SI unit that torques are known in instead of N m or N, None if they are known in these."""
+        return next((s.driven_by for s in self.sensor if s.is_bare), None)
 
     @property
     def contacts(self) -> tuple[Body, ...]:
@@ -731,7 +855,7 @@ class Machine(FileRecord):
         straight = self.find(sensor.body).joint == "prismatic"
         if sensor.kind in ("angle", "wheel"):
             return ("m" if straight and sensor.kind == "angle" else "rad") + ("/s" if sensor.is_rate else "")
-        torque = "A" if self.in_ratios else "N" if straight else "N m"
+        torque = self.torque_unit or ("N" if straight else "N m")
         return {"torque": torque, "yaw_rate": "rad/s", "x": "m", "y": "m"}.get(sensor.kind, "m/s")
 
     def _visible(self, sensor: Sensor) -> bool:
@@ -753,6 +877,7 @@ class Machine(FileRecord):
         self._check_springs()
         self._check_locked()
         self._check_sensors()
+        self._check_world()
         if self.problem is not None and self.problem not in self.problems:
             allowed = ", ".join(self.problems) or "none is declared"
             hint = did_you_mean(self.problem, self.problems)
@@ -796,7 +921,8 @@ class Machine(FileRecord):
                 raise ValueError(f"body[{k}].index: {body.index} is given twice, every body needs its own")
             if k == 0 and body.antecedent != "ground":
                 raise ValueError(f'body[0].antecedent: the first body must stand on "ground" (got {body.antecedent})')
-            if k > 0 and body.antecedent not in seen:
+            grounded = body.antecedent == "ground" and not self.planar and body.joint != "planar"
+            if k > 0 and body.antecedent not in seen and not grounded:
                 known = ", ".join(map(str, sorted(seen)))
                 raise ValueError(f"body[{k}].antecedent: {body.antecedent} is not a body above it, allowed: {known}")
             if names & {body.name, body.where}:
@@ -810,6 +936,15 @@ class Machine(FileRecord):
         """Check that coupled joints name others that exist, lead and, for a common torque, are driven."""
         known = {b.index: b for b in self.body}
         for k, body in enumerate(self.body):
+            turns_with = None if body.drive is None else body.drive.turns_with
+            if turns_with is not None:
+                other, where = known.get(turns_with.joint), f"body[{k}].drive.turns_with"
+                if other is None or other.joint != "revolute" or other is body or not body.actuated:
+                    raise ValueError(f"{where}: needs another revolute joint, and a drive at this one (actuated)")
+                if other.drive is not None and other.drive.turns_with is not None:
+                    raise ValueError(f"{where}.joint: the rotor of joint {other.index} turns with another one itself")
+                if turns_with.offset.value:
+                    raise ValueError(f"{where}.offset: is for moves_with, a rotor has none")
             for key in ("moves_with", "driven_with"):
                 coupling: Coupling | None = getattr(body, key)
                 if coupling is None:
@@ -818,6 +953,8 @@ class Machine(FileRecord):
                 if other is None or other.joint not in ("revolute", "prismatic") or other is body:
                     joints = [b.index for b in self.body if b.joint in ("revolute", "prismatic") and b is not body]
                     raise ValueError(f"{where}: no other joint {coupling.joint}, allowed: {joints}")
+                if key == "driven_with" and coupling.offset.value:
+                    raise ValueError(f"body[{k}].driven_with.offset: is for moves_with, a torque has none")
                 if key == "driven_with" and not other.actuated:
                     raise ValueError(f"{where}: joint {other.index} isn't actuated: give the drive that both share")
                 if key == "moves_with" and other.moves_with is not None:
@@ -864,6 +1001,21 @@ class Machine(FileRecord):
         if not self.actuated:
             raise ValueError("body: no joint is actuated, so nothing can drive the machine")
 
+    def _check_world(self) -> None:
+        """Check the bodies that tool and surroundings name, and that shapes and planned rates belong to an arm."""
+        if self.tool is not None and self.tool.body not in {b.index for b in self.body}:
+            raise ValueError(f"tool.body: no body {self.tool.body}, allowed: {[b.index for b in self.body]}")
+        things = [*(p.name for p in self.world.plane), *(b.name for b in self.world.box)]
+        every = ["ground", "floor", *(b.name for b in self.body), *things]
+        for name in things:
+            if every.count(name) > 1:
+                raise ValueError(f"world: the name {name} is used twice")
+        for k, pair in enumerate(self.world.apart):
+            for name in pair:
+                if name not in every:
+                    hint = did_you_mean(name, every)
+                    raise ValueError(f"world.apart[{k}]: nothing is called {name}, allowed: {', '.join(every)}{hint}")
+
     def _check_sensors(self) -> None:
         """Check bodies, names and columns of the sensors."""
         known = {b.index: b for b in self.body}
@@ -877,6 +1029,10 @@ class Machine(FileRecord):
                 raise ValueError(f"sensor[{k}].body: no body {sensor.body}, allowed: {sorted(known)}")
             if sensor.kind == "angle" and sensor.body not in jointed:
                 raise ValueError(f"sensor[{k}].body: body {sensor.body} has no joint to measure, allowed: {jointed}")
+            if sensor.kind == "angle" and self.offset(known[sensor.body]):
+                raise ValueError(
+                    f"sensor[{k}].body: joint {sensor.body} moves with another one by an offset: measure that one"
+                )
             if sensor.kind == "torque" and sensor.body not in driven:
                 raise ValueError(
                     f"sensor[{k}].body: joint {sensor.body} isn't actuated, allowed: {driven}; a common torque is that"
@@ -895,10 +1051,12 @@ class Machine(FileRecord):
                 if column in columns:
                     raise ValueError(f"sensor[{k}].column: {column} is used twice")
                 columns.add(column)
-            if self.in_ratios and sensor.kind == "torque" and not sensor.is_bare_current:
+            other = not sensor.is_bare or sensor.driven_by != self.torque_unit
+            if self.in_ratios and sensor.kind == "torque" and other:
                 raise ValueError(
-                    f"sensor[{k}].unit: either every torque is a current of motors whose common torque_constant is"
-                    " unknown, or none: joints share parameters, which can't be in two units"
+                    f"sensor[{k}].unit: either every torque is a current (or every one a voltage or a duty cycle) of"
+                    " motors whose common torque_constant is unknown, or none: joints share parameters, which can't be"
+                    " in two units"
                 )
             if sensor.cylinders:
                 self._check_cylinders(f"sensor[{k}].cylinders", sensor)
@@ -925,20 +1083,11 @@ class Machine(FileRecord):
             raise ValueError(f"{key}: can't be sought, the lever of the cylinders at joint {body.index} depends on it")
 
     def _check_ratios(self) -> None:
-        """Check that nothing of a machine whose torques are bare currents asks for torques in N m."""
+        """Check that the drives of a machine with an unknown torque constant can share it."""
         if len({b.joint for b in self.actuated}) > 1:
             raise ValueError(
                 "sensor.torque_constant: revolute and prismatic joints can't share an unknown one, give it"
             )
-        quantities = [(f"known.{n}", q) for n, q in self.known.items()]
-        for body in self.body:
-            for table in ("inertia", "friction", "drive", "spring", "contact"):
-                record = getattr(body, table)
-                names = type(record).model_fields if record is not None else ()
-                quantities += [(f"body.{body.name}.{table}.{n}", getattr(record, n)) for n in names]
-        for key, quantity in quantities:
-            if getattr(quantity, "known", False):
-                raise ValueError(f"{key}: known needs torques in N m, give every current its torque_constant")
 
     def _check_cylinders(self, key: str, sensor: Sensor) -> None:
         """Check that each pressure turns the joint the same way along its range, and that its angle is measured."""
@@ -1019,9 +1168,11 @@ def _find(name: str) -> Path:
         own = Path(f"{name}.toml")
         if own.is_file():
             raise MachineError(f"{name}: is no shipped machine; for the file beside it write {own}")
+        hint = did_you_mean(name, (*shipped_machines(), *(p.name for p in sorted(Path().glob("*.toml")))))
         raise MachineError(
-            f"{name}: no such machine, allowed: {', '.join(shipped_machines())}, or a path to a .toml file"
+            f"{name}: no such machine, allowed: {', '.join(shipped_machines())}, or a path to a .toml file{hint}"
         )
     if not path.is_file():
-        raise MachineError(f"{name}: no such file")
+        hint = did_you_mean(name, (str(p) for p in sorted(path.parent.glob("*.toml"))))
+        raise MachineError(f"{name}: no such file{hint}")
     return path

@@ -14,20 +14,35 @@ from pydantic_core import ErrorDetails
 
 from excite.text import did_you_mean
 
+MOST_BYTES = 5_000_000  # of a TOML file; those of machines have 20 kB; chosen
+MOST_ENTRIES = 50_000  # keys and elements of lists in it; chosen
+MOST_SAID = 100  # faults of a file that are listed; chosen
+
 Source = Literal["paper", "data sheet", "measured", "published", "identified", "assumed", "definition"]
 
 
 def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file, with or without byte-order mark. Raises ValueError, one line."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        if path.stat().st_size > MOST_BYTES:
+            raise ValueError(f"more than {MOST_BYTES // 10**6} MB")
+        found = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        if _entries(found) > MOST_ENTRIES:
+            raise ValueError(f"holds more than {MOST_ENTRIES} keys")
+        return found
     except UnicodeDecodeError as err:
         line = err.object.count(b"\n", 0, err.start) + 1
         raise ValueError(f"{path}: not a TOML file: line {line} is not UTF-8; save it as UTF-8") from None
-    except (tomllib.TOMLDecodeError, RecursionError) as err:
+    except (ValueError, RecursionError) as err:  # also an integer of thousands of digits
         raise ValueError(f"{path}: not a TOML file: {err}") from None
     except OSError as err:
         raise ValueError(f"{path}: can't be read: {err.strerror}") from None
+
+
+def _entries(value: Any) -> int:
+    """Count the keys and elements of nested tables and lists."""
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return len(inside) + sum(map(_entries, inside))
 
 
 _PLAIN = re.compile(r"^\s*[+-]?\d+(\.\d*)?\s*$")
@@ -41,6 +56,8 @@ def _number(value: Any) -> Any:
     """
     if isinstance(value, bool):
         raise ValueError("must be a number, not true/false")
+    if isinstance(value, int) and abs(value) > 10**18:
+        raise ValueError("must be 0 or of a size between 1e-12 and 1e12, in SI units")
     if isinstance(value, str):
         if _PLAIN.match(value):
             return float(value)
@@ -66,8 +83,8 @@ def _known(value: Any) -> Any:
     """Check `known`: true, or a standard deviation above zero. Raises ValueError."""
     if isinstance(value, bool):
         return value
-    if not isinstance(value, (int, float)) or not math.isfinite(value) or value <= 0:
-        raise ValueError(f"must be true (known exactly) or a standard deviation > 0 (got {value!r})")
+    if not isinstance(value, (int, float)) or not 0 < value < 1e18:
+        raise ValueError(f"must be true (known exactly) or a standard deviation > 0 (got {reprlib.repr(value)})")
     return float(value)
 
 
@@ -106,12 +123,21 @@ class Quantity(FileRecord):
     """A value [SI] and its source.
 
     known: true if the value is exact, or its standard deviation; identification then uses it like a measurement.
+    tolerance: standard deviation [SI] of a value that identification takes as it is, such as a length: it widens the
+    intervals. Without one the default of its kind holds (`Tolerances`); a value by definition is exact.
     """
 
     value: Number
     source: Source
     note: str = ""
     known: Known = False
+    tolerance: Annotated[float | None, Field(ge=0, allow_inf_nan=False)] = None
+
+    def tolerance_or(self, default: float) -> float:
+        """Return the stated tolerance, zero for a value by definition, or the default of its kind."""
+        if self.tolerance is not None:
+            return self.tolerance
+        return 0.0 if self.source == "definition" else default
 
     def __float__(self) -> float:
         return self.value
@@ -134,13 +160,13 @@ class BodyPoint(FileRecord):
 
 def error_line(path: Path | str, err: ValidationError, root: type[FileRecord]) -> str:
     """Return the first error of a file that holds a `root` record: file, key, problem, what is allowed."""
-    first, *more = error_lines(path, err, root)
-    return f"{first} (and {len(more)} more)" if more else first
+    first = error_lines(path, err, root, most=1)[0]
+    return f"{first} (and {err.error_count() - 1} more)" if err.error_count() > 1 else first
 
 
-def error_lines(path: Path | str, err: ValidationError, root: type[FileRecord]) -> list[str]:
-    """Return all errors of a file that holds a `root` record, a line each."""
-    texts = [error_text(one, root) for one in err.errors(include_url=False)]
+def error_lines(path: Path | str, err: ValidationError, root: type[FileRecord], most: int = MOST_SAID) -> list[str]:
+    """Return the errors of a file that holds a `root` record, a line each, up to so many."""
+    texts = [error_text(one, root) for one in err.errors(include_url=False)[:most]]
     return [" ".join(f"{path}: {key + ': ' if key else ''}{message}".split()) for key, message in texts]
 
 

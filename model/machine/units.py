@@ -43,6 +43,9 @@ UNITS: dict[str, tuple[str, float]] = {
     "lbf": ("force", POUND_FORCE),
     "A": ("current", 1.0),
     "mA": ("current", 1e-3),
+    "V": ("voltage", 1.0),
+    "mV": ("voltage", 1e-3),
+    "%": ("duty", 1e-2),
     "Pa": ("pressure", 1.0),
     "kPa": ("pressure", 1e3),
     "MPa": ("pressure", 1e6),
@@ -60,7 +63,7 @@ UNITS: dict[str, tuple[str, float]] = {
 QUANTITIES_BY_KIND: dict[str, tuple[str, ...]] = {
     "angle": ("angle", "length", "angular rate", "speed"),
     "wheel": ("angle", "angular rate"),
-    "torque": ("torque", "force", "current"),
+    "torque": ("torque", "force", "current", "voltage", "duty"),
     "yaw_rate": ("angular rate",),
     "lateral_speed": ("speed",),
     "forward_speed": ("speed",),
@@ -69,6 +72,8 @@ QUANTITIES_BY_KIND: dict[str, tuple[str, ...]] = {
     "y": ("length",),
 }
 RATES = ("angular rate", "speed")
+# what a motor is driven by: its torque is a constant times that; its SI unit
+DRIVEN_BY = {"current": "A", "voltage": "V", "duty": "1"}
 
 
 # unit of a parameter divided by a torque constant [N m/A], or by a force constant [N/A] of sliding joints

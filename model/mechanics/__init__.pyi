@@ -1,3 +1,4 @@
+from .angles import round_angle as round_angle
 from .contact import (
     Saturation as Saturation,
     Slip as Slip,

@@ -19,6 +19,7 @@ import casadi as ca
 import numpy as np
 
 from excite.model.machine import Body, Machine
+from excite.model.mechanics.angles import round_angle
 
 # standard inertial parameters of a body
 INERTIAL = ("M", "MX", "MY", "MZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
@@ -48,14 +49,17 @@ def _snap_to_integer(value: float) -> float:
 
 
 def _rot_x(angle: float) -> ca.SX:
-    """Return the rotation (3, 3) about x by an angle [rad]."""
+    """Return the rotation (3, 3) about x by an angle [rad] of the geometry."""
+    angle = round_angle(angle)
     c, s = _snap_to_integer(math.cos(angle)), _snap_to_integer(math.sin(angle))
     return ca.sparsify(ca.SX([[1, 0, 0], [0, c, -s], [0, s, c]]))
 
 
 def rot_z(angle: ca.SX | float) -> ca.SX:
-    """Return the rotation (3, 3) about z by an angle [rad]."""
+    """Return the rotation (3, 3) about z by an angle [rad], a symbol or one of the geometry."""
     number = isinstance(angle, float)
+    if isinstance(angle, float):
+        angle = round_angle(angle)
     c = ca.SX(_snap_to_integer(math.cos(angle))) if number else ca.cos(angle)
     s = ca.SX(_snap_to_integer(math.sin(angle))) if number else ca.sin(angle)
     R = ca.SX.eye(3)
@@ -181,7 +185,11 @@ def body_poses(machine: Machine, q: Mapping[str, float]) -> dict[int, tuple[np.n
     """
     every = [c for b in machine.body for c in b.coordinates]
     still = dict.fromkeys(every, ca.SX(0))
-    frames = body_motions(machine, still | {c: ca.SX(x) for c, x in q.items()}, still, still, ca.SX(3, 1))
+    at = still | {c: ca.SX(x) for c, x in q.items()}
+    for b in machine.body:
+        if b.moves_with is not None:
+            at[b.coordinates[0]] = machine.ratio(b) * at[machine.coordinate(b)] + machine.offset(b)
+    frames = body_motions(machine, at, still, still, ca.SX(3, 1))
     return {k: (ca.DM(f.rotation).full(), ca.DM(f.position).full()[:, 0]) for k, f in frames.items()}
 
 

@@ -25,7 +25,7 @@ from support import studies
 from excite import output
 from excite.model import prediction
 from excite.model.machine import machine
-from excite.reports import COLOURS, save
+from excite.reports import COLOURS, legend_below, new_figure, save
 from excite.trajectories import bound_accuracy, compose_objective, design, sigma_percent
 
 RIG = HERE.parents[1] / "tests" / "support" / "rig.toml"
@@ -86,22 +86,26 @@ def main() -> None:
 
 def figure(bounds: Values, designs: dict[str, Values]) -> Figure:
     """Plot designs over the bounds, for each way to judge them."""
-    fig = Figure(figsize=(7.5, 4.0), layout="constrained")
+    fig = new_figure(7.5, 4.0)
     ax = fig.subplots()
     width = 0.8 / len(designs)
     for k, (name, values) in enumerate(designs.items()):
         above = [100 * (values[of] / bound - 1) for of, bound in bounds.items()]
         at = np.arange(len(bounds)) + (k - (len(designs) - 1) / 2) * width
-        bars = ax.bar(at, above, width, color=COLOURS[k], edgecolor="black", label=f"design for {name}")
-        ax.bar_label(bars, fmt="%.1f", fontsize=7)
+        ax.plot(at, above, "osD^"[k % 4], color=COLOURS[k], label=f"design for {name}")
+        for x, y in zip(at, above, strict=True):
+            ax.annotate(f"{y:.1f}", (x, y), xytext=(0, 6), textcoords="offset points", ha="center", fontsize=8)
     words = {"accuracy": "worst and mean\n(geometric mean)", "worst": "worst", "mean": "mean", "median": "median"}
-    ax.set_xticks(range(len(bounds)), [f"{words[of]}\nbound {bound:.4f} %" for of, bound in bounds.items()])
+    labels = [f"{words[of]}\nbound {bound:.4f} %" for of, bound in bounds.items()]
+    ax.set_xticks(range(len(bounds)), labels, fontsize=8)
+    for edge in np.arange(len(bounds) - 1) + 0.5:
+        ax.axvline(edge, color="0.8", linewidth=0.8)
     ax.set_yscale("log")
-    ax.set_ylim(0.1, None)
+    ax.set_ylim(0.1, 600)
     ax.yaxis.set_major_formatter("{x:g}")
-    ax.set_ylabel("standard deviation above the bound [%]")
+    ax.set_ylabel("standard deviation above the bound [%]", fontsize=9)
     ax.grid(axis="y", alpha=0.3)
-    ax.legend(fontsize=8, loc="upper left")
+    legend_below(fig, *ax.get_legend_handles_labels())
     return fig
 
 

@@ -41,6 +41,7 @@ from support.surprises import SURPRISES
 from support.visibility import VISIBLE, visibility
 
 from excite.output import new_file
+from excite.reports import COLOURS, legend_below
 
 Row = dict[str, Any]
 # First case number of each kind that is held out; lower ones were used in development.
@@ -51,6 +52,13 @@ FRESH = {
     "pair": 106,
 }
 GOOD = ("right", "tied")  # a tie that holds the cause counts as right
+SAID = {  # outcomes in the figure, with what they are called there
+    "right": "right (surprises: unexplained)",
+    "place": "right effect, wrong place",
+    "another name": "another name",
+    "unexplained": "unexplained",
+    "clean": "clean",
+}
 ROLLER = [
     ROOT / "tests" / "support" / n for n in ("plant.py", "causes.py", "surprises.py", "blind.py", "visibility.py")
 ]
@@ -171,29 +179,36 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def confusion(rows: Sequence[Row]) -> Figure:
-    """Plot hidden against named effects of the visible cases; a tie that holds the true one counts as right."""
-    across = [*CAUSES, "other names", "wrong place", "unexplained", "clean", "failed"]
-    down = ["nothing", *CAUSES, *SURPRISES]
-    table = np.zeros((len(down), len(across)), int)
+    """Plot what is said of each hidden effect of the visible cases, with the other names that are given.
+
+    A tie that holds the true effect counts as right; a surprise, which has no name, is right as unexplained.
+    """
+    said: dict[str, list[tuple[str, str]]] = {name: [] for name in ("nothing", *CAUSES, *SURPRISES)}
     for r in rows:
         if r["kind"] == "pair" or (r["kind"] != "nothing" and r["visibility"] < VISIBLE):
             continue
         hidden = r["hidden"][0].split("@")[0] if r["hidden"] else "nothing"
-        said = hidden if r["outcome"] in GOOD and r["kind"] == "cause" else r["named"].split("@")[0]
-        said = "wrong place" if r["outcome"] == "place" else said
-        table[down.index(hidden), across.index(said if said in across else "other names")] += 1
-    figure = Figure(figsize=(13, 15), layout="constrained")
-    ax = figure.subplots()
-    share = table / np.maximum(table.sum(axis=1, keepdims=True), 1)
-    ax.imshow(share, cmap="Blues", vmin=0, vmax=1.4, aspect="auto")
-    for i, j in zip(*np.nonzero(table), strict=True):
-        ax.text(j, i, str(table[i, j]), ha="center", va="center", fontsize=8)
-    ax.set_xticks(range(len(across)), across, rotation=90, fontsize=8)
-    ax.set_yticks(range(len(down)), down, fontsize=8)
-    ax.hlines([0.5, len(CAUSES) + 0.5], -0.5, len(across) - 0.5, color="0.4", linewidth=0.8)
-    ax.vlines(len(CAUSES) - 0.5, -0.5, len(down) - 0.5, color="0.4", linewidth=0.8)
-    ax.set_xlabel("named")
-    ax.set_ylabel(f"hidden (chi-squared at least {VISIBLE:g})")
+        good = {"nothing": ("clean",), "cause": GOOD, "surprise": ("unexplained",)}[r["kind"]]
+        outcome = "right" if r["outcome"] in good else r["outcome"] if r["outcome"] in SAID else "another name"
+        said[hidden].append((outcome, r["named"].split("@")[0] if outcome == "another name" else ""))
+    hidden_effects = [name for name, own in said.items() if own]
+    figure = Figure(figsize=(11, 6.6), layout="constrained")
+    axes = figure.subplots(1, 2, sharex=True)
+    for ax, part in zip(axes, np.array_split(hidden_effects, 2), strict=True):
+        places, left = np.arange(len(part))[::-1], np.zeros(len(part))
+        for k, (kind, word) in enumerate(SAID.items()):
+            share = np.array([100 * np.mean([one[0] == kind for one in said[n]]) for n in part])
+            style = {"color": COLOURS[k], "hatch": ("", "//", "..", "xx", "--")[k], "edgecolor": "white"}
+            ax.barh(places, share, left=left, height=0.7, label=word, **style)
+            left += share
+        for y, name in zip(places, part, strict=True):
+            others = "".join(f", {n}" for n in sorted({n for _, n in said[name] if n}))
+            ax.annotate(f"{len(said[name])}{others}", (102, y), va="center", fontsize=8)
+        ax.set_yticks(places, [name.replace("_", " ") for name in part], fontsize=8)
+        ax.set(xlim=(0, 118), ylim=(-0.7, len(part) - 0.3), xticks=(0, 25, 50, 75, 100))
+        ax.set_xlabel("said of the effect [% of its cases]; their number")
+        ax.tick_params(labelsize=8)
+    legend_below(figure, *axes[0].get_legend_handles_labels())
     return figure
 
 

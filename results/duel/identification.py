@@ -261,7 +261,7 @@ def own(method: str) -> Callable[[pd.DataFrame], Interval]:
 
 
 CONTENDERS: dict[str, tuple[Callable[[pd.DataFrame], Interval], str | None]] = {  # and the package that it needs
-    **{f"excite, {method}": (own(method), None) for method in ("joint", "oe", "ols")},
+    **{f"excite, {method}": (own(method), None) for method in ("joint", "ols")},
     "SciPy output error": (scipy_output_error, None),
     "pyPESTO": (pypesto_profiles, "pypesto"),
     "mujoco.sysid": (mujoco_sysid, "mujoco"),

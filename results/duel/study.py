@@ -35,7 +35,7 @@ from matplotlib.figure import Figure
 from scipy.optimize import minimize
 
 from excite import trajectories, workflows
-from excite.reports import COLOURS, save
+from excite.reports import COLOURS, new_figure, save
 from excite.simulation import inverse_dynamics
 from excite.text import format_number
 from excite.trajectories import JointMotion, MotionProgram, joint_motion, joint_search
@@ -260,16 +260,19 @@ def contender_versions() -> dict[str, str]:
 
 
 def figure(rows: list[dict[str, Any]]) -> Figure:
+    """Plot the condition numbers that the contenders reach, and by how much they exceed a limit."""
     shown = [r for r in rows if "missing" not in r][::-1]
-    fig = Figure(figsize=(8, 3), layout="constrained")
+    fig = new_figure(8, 3)
     ax = fig.subplots()
-    names = [r["name"] for r in shown]
-    ax.barh(names, [r["cond_phi"] for r in shown], color=[COLOURS[0] if "excite" in n else "0.6" for n in names])
+    over = [
+        f"\nlimit exceeded by {format_number(100 * r['max_violation'], 2)} %" * bool(r["worst_limit"]) for r in shown
+    ]
+    ax.barh(range(len(shown)), [r["cond_phi"] for r in shown], color=["0.6" if o else COLOURS[0] for o in over])
     for k, r in enumerate(shown):
-        over = "" if not r["worst_limit"] else f", limit exceeded by {format_number(100 * r['max_violation'], 2)} %"
-        ax.annotate(f" {r['cond_phi']:.2f}{over}", (r["cond_phi"], k), va="center")
-    ax.set_xlabel("cond(Phi), lower is better")
-    ax.margins(x=0.5)
+        ax.annotate(f" {r['cond_phi']:.2f}", (r["cond_phi"], k), va="center", fontsize=9)
+    ax.set_yticks(range(len(shown)), [r["name"] + o for r, o in zip(shown, over, strict=True)], fontsize=9)
+    ax.set_xlabel("cond(Phi) of the drive, lower is better")
+    ax.set_xlim(0, 1.15 * max(r["cond_phi"] for r in shown))
     ax.spines[["top", "right"]].set_visible(False)
     return fig
 

@@ -132,16 +132,13 @@ def loop(raw: dict[str, np.ndarray]) -> dict[str, float]:
 
 def readme(found: dict[str, dict[str, object]], own: dict[str, float], late: dict[str, float]) -> str:
     names = list(PUBLISHED["value"])  # type: ignore[call-overload]
-    own_std: Any = found["wls"]["std"]
-    published_std: Any = PUBLISHED["std"]
-    short = [own_std[n] / published_std[n] for n in names]
     lines = [
         "# EMPS by every method",
         "",
         "Real measurements of an electro-mechanical positioning system (Janot, Gautier, Brunot, 2019).",
         "",
         "**Result.** The methods agree within 2 %, and least squares reproduces the published estimates. The standard",
-        f"deviations published with them are {min(short):.2g} to {max(short):.2g} times too small: residuals are"
+        f"deviations published with them are up to {found['ols']['understated']:.2g} times too small: residuals are"
         " autocorrelated.",
         "",
         "`python results/emps/study.py --out results/emps` rebuilds this page and `methods.json`; [identify](identify)",
@@ -164,7 +161,7 @@ def readme(found: dict[str, dict[str, object]], own: dict[str, float], late: dic
         The methods agree within {_range_percent(found, "M"):.1f} % in M, {_range_percent(found, "Fv"):.1f} % in Fv,
         {_range_percent(found, "Fc"):.1f} % in Fc."""),
         _bullet("""
-        `ols`, as its authors use it, assumes independent residuals. `wls`, `iv`, `tls` allow for autocorrelation."""),
+        `ols`, as its authors use it, assumes independent residuals; `inverse` and `joint` do not."""),
         _bullet("""
         `joint` finds an effect outside the model (the authors report screw friction that depends on direction), adds
         process noise, and states that its intervals do not hold."""),
@@ -207,11 +204,13 @@ def main() -> None:
         except NoEstimateError as failure:
             print(f"{method}: {failure}")
             continue
+        X = e.value_or(model.nominal)
         found[method] = {
             "value": {n: float(f"{v:.7g}") for n, v in zip(e.names, e.value, strict=True)},
             "std": {n: float(f"{v:.4g}") for n, v in zip(e.names, e.std, strict=True)},
             "relative_error_percent": float(f"{e.relative_error_percent:.5g}"),
-            "closed_loop_percent": {k: float(f"{v:.4g}") for k, v in closed_loop(model, raw, e.value).items()},
+            "closed_loop_percent": {k: float(f"{v:.4g}") for k, v in closed_loop(model, raw, X).items()},
+            "understated": float(f"{e.understated:.3g}"),
             "notes": [note.replace(str(path), path.name) for note in e.notes],
         }
     own = loop(raw)

@@ -34,12 +34,15 @@ RUNS = 30  # simulated test days
 
 @dataclass(frozen=True)
 class Machine:
-    """A machine's logs, and what is known of it from elsewhere. validated: logs that are predicted, not fitted."""
+    """A machine's logs, and what is known of it from elsewhere.
+
+    validated: logs that are predicted, not fitted. method: of identification, the recommended one if not given.
+    """
 
     logs: tuple[str, ...]
     remark: str
     validated: tuple[str, ...] = ()
-    method: str = "wls"
+    method: str | None = None
 
 
 MACHINES = {
@@ -52,7 +55,7 @@ MACHINES = {
         ("franka_panda/exciting_trajectory_1.csv",),
         "Its authors publish 43 inertial base parameters and half the height of a sigmoid as friction by joint: 0.273,"
         " 0.436, 0.320, 0.640, 0.420, 0.152, 0.282 N m.",
-        method="wls+consistent",
+        method="inverse+consistent",
     ),
     "pendulum": Machine(
         ("dfki_pendulum/data_measured.csv",),
@@ -72,7 +75,7 @@ MACHINES = {
         "Motor currents. An independent fit without rotor inertia errs on another log by 10.2, 3.8, 3.5, 9.2, 25.0 and"
         " 51.2 % by joint.",
         ("ur10e/20_02_19_15harm50sec.csv",),
-        "wls+consistent",
+        "inverse+consistent",
     ),
 }
 
@@ -113,7 +116,8 @@ def make(name: str, place: Path, work: Path) -> dict[str, dict[str, Any]]:
             shutil.copy(work / "verify" / "verify.png", place / "verify.png")
     if one.logs and all((DATA / log).is_file() for log in one.logs + one.validated):
         validate = [word for log in one.validated for word in ("--validate", DATA / log)]
-        step("identify", name, *(DATA / log for log in one.logs), *validate, "--method", one.method)
+        method = ["--method", one.method] if one.method else []
+        step("identify", name, *(DATA / log for log in one.logs), *validate, *method)
     for kind in ("design", "verify", "identify"):
         path = place / f"{kind}.json"
         if path.is_file():
@@ -163,7 +167,8 @@ def identify_lines(name: str, steps: dict[str, dict[str, Any]]) -> list[str]:
         return []
     s = steps["identify"]
     one = MACHINES[name]
-    asked = [*one.logs, *(f"--validate {log}" for log in one.validated), f"--method {one.method}"]
+    asked = [*one.logs, *(f"--validate {log}" for log in one.validated)]
+    asked += [f"--method {one.method}"] if one.method else []
     by_joint = ", ".join(f"{format_percent(e['percent'], 3)} ({joint})" for joint, e in s["error_by_joint"].items())
     lines = [
         f"- **Its log**: `excite identify {name} {' '.join(asked)}`: status `{s['status']}`"

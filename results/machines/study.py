@@ -31,7 +31,7 @@ from excite import output, smoothing
 from excite.identification import methods, summarise_runs, verify
 from excite.model import Model, prediction
 from excite.model.machine import Problem, machine
-from excite.reports import COLOURS, format_sum, save
+from excite.reports import COLOURS, format_sum, legend_above, new_figure, save, set_title
 from excite.reports.top_view import draw_machine
 from excite.simulation import Motion, simulate
 from excite.text import format_number
@@ -179,9 +179,10 @@ def sigma(model: Model, motion: Motion) -> np.ndarray:
 def figure(model: Model, drive: dict[str, Any], runs: dict[str, Any], others: list[dict[str, Any]]) -> Figure:
     """Plot the machine from above, errors against the predicted intervals, and the drive among random ones."""
     n = len(model.base.names)
-    fig = Figure(figsize=(11.5, max(4.5, 1.2 + 0.21 * n)), layout="constrained")
-    above, errors, among = fig.subplots(1, 3, width_ratios=(1.0, 1.2, 1.0))
-    fig.suptitle(model.machine.title, fontsize=11)
+    fig = new_figure(11.5, max(7.0, 1.2 + 0.2 * n))
+    axes = fig.subplot_mosaic([["above", "errors"], ["among", "errors"]])
+    above, errors, among = (axes[name] for name in ("above", "errors", "among"))
+    set_title(fig, model.machine.title)
     draw_machine(above, model.machine)
     _errors(errors, runs)
     for good, face, label in ((True, COLOURS[0], "random multisine"), (False, "none", "the same, violates a limit")):
@@ -198,9 +199,10 @@ def figure(model: Model, drive: dict[str, Any], runs: dict[str, Any], others: li
         axis.set_minor_locator(NullLocator())
         axis.set_major_formatter("{x:g}")
     among.set_xlabel("cond(Phi)")
-    among.set_ylabel("worst parameter: attainable standard deviation [%]")
+    among.set_ylabel("worst parameter: attainable\nstandard deviation [%]", fontsize=9)
     among.grid(alpha=0.3, which="both")
-    among.legend(fontsize=8)
+    among.tick_params(labelsize=8)
+    legend_above(among, 4.5)
     return fig
 
 
@@ -214,7 +216,7 @@ def _errors(ax: Axes, runs: dict[str, Any]) -> None:
     ax.axvline(0, color="black", linewidth=0.8)
     ax.set_xscale("symlog", linthresh=1.0)
     ax.xaxis.set_major_formatter("{x:g}")
-    ax.set_yticks(range(len(names)), names[::-1], fontsize=7)
+    ax.set_yticks(range(len(names)), names[::-1], fontsize=8)
     ax.set_xlabel("error of one run [%]; grey: predicted 95 % interval")
     ax.grid(axis="x", alpha=0.3)
 

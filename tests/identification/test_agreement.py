@@ -49,9 +49,7 @@ def test_another_soil_is_named_with_its_values(
     measure(straight, straight_motion, seed=1).to_csv(paths[0], index=False)
     motion = simulate(other, straight_motion.u, q0=straight_motion.q[0], nu0=straight_motion.nu[0])
     measure(other, motion, seed=2).to_csv(paths[1], index=False)
-    code, stdout, _ = excite(
-        "identify", "va12_straight", *paths, "--method", "tls", "--out", tmp_path / "out", "--json"
-    )
+    code, stdout, _ = excite("identify", "va12_straight", *paths, "--out", tmp_path / "out", "--json")
     assert code == 0
     summary = json.loads(stdout)
     assert summary["agreement"]["agree"] is False
@@ -72,7 +70,7 @@ def test_another_soil_is_named_with_its_values(
 
 
 def test_one_log_has_nothing_to_agree_with(straight: Model, straight_motion: Motion) -> None:
-    one = identify(straight, [make_log(straight, straight_motion, seed=1)], "tls")
+    one = identify(straight, [make_log(straight, straight_motion, seed=1)], "ols")
     assert compare_logs(("a",), [one]) is None
 
 
@@ -107,5 +105,5 @@ class _Estimate:
 
 def test_tables_are_compared_as_files_are(straight: Model, straight_motion: Motion) -> None:
     tables = [measure(straight, straight_motion, seed=s) for s in (1, 2)]
-    estimate = excite.identify("va12_straight", tables, "tls")
+    estimate = excite.identify("va12_straight", tables, "joint")
     assert "one set of parameters explains the 2 logs" in estimate.notes[0]

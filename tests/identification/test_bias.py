@@ -18,11 +18,10 @@ def logs(straight: Model, straight_motion: Motion) -> list[Log]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["ols", "wls"])
-def test_the_bias_is_found_from_one_log(straight: Model, logs: list[Log], method: str) -> None:
+def test_the_bias_is_found_from_one_log(straight: Model, logs: list[Log]) -> None:
     """Mean error over 24 logs beside what simulations of one of them say."""
-    true = np.mean([methods.identify(straight, [one], method).value for one in logs], axis=0) - straight.nominal
-    estimate = methods.add_bias(straight, logs[:1], methods.identify(straight, logs[:1], method))
+    true = np.mean([methods.identify(straight, [one], "ols").value for one in logs], axis=0) - straight.nominal
+    estimate = methods.add_bias(straight, logs[:1], methods.identify(straight, logs[:1], "ols"))
     assert estimate.bias is not None
     assert estimate.bias_std is not None
     for name in ("M", "ZZ1", "ZZ4", "Kx1", "Kx4"):
@@ -30,14 +29,6 @@ def test_the_bias_is_found_from_one_log(straight: Model, logs: list[Log], method
         assert estimate.bias[k] == pytest.approx(true[k], rel=0.35)
     assert "biased on 8 simulated logs" in estimate.notes[-1]
     assert "ZZ1 +" in estimate.notes[-1]
-
-
-def test_consistent_methods_are_told_apart(straight: Model, logs: list[Log]) -> None:
-    estimate = methods.add_bias(straight, logs[:1], methods.identify(straight, logs[:1], "tls"))
-    assert estimate.bias is not None
-    assert (np.abs(estimate.bias) < 1.5 * estimate.std).all()
-    heavy = straight.base.names.index("ZZ1")
-    assert abs(estimate.bias[heavy]) < 0.02 * straight.scale[heavy]
 
 
 def test_replay_stays_with_the_log(straight: Model, straight_motion: Motion, logs: list[Log]) -> None:
@@ -50,10 +41,10 @@ def test_replay_stays_with_the_log(straight: Model, straight_motion: Motion, log
 
 
 def test_an_impossible_machine_is_replaced_by_the_nearest(straight: Model, logs: list[Log]) -> None:
-    estimate = methods.identify(straight, logs[:1], "wls")
+    estimate = methods.identify(straight, logs[:1], "ols")
     value = estimate.value.copy()
     value[straight.base.names.index("Fv4")] = -50
-    method, filter = methods.METHODS["wls"].find, straight.machine.filter
+    method, filter = methods.METHODS["ols"].find, straight.machine.filter
     found = bias.add_bias(straight, logs[:1], estimate, method, filter, value, 2)
     assert found.bias is not None
     assert np.isfinite(found.bias).all()

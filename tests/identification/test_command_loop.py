@@ -87,21 +87,21 @@ def test_simulated_logs_hold_the_command_that_the_motion_takes() -> None:
     assert before_loop(loop, np.full(50, 7.0), 0.002) == pytest.approx(7.0)
 
 
-@pytest.mark.parametrize(("method", "honest"), [("wls", 1), ("joint", 4)])
-def test_the_known_loop_takes_the_bias_away(method: str, honest: int) -> None:
-    """honest: number of parameters whose intervals hold; regression's friction is off with measured forces, too."""
+def test_the_known_loop_takes_the_bias_away() -> None:
+    """Without the loop joint smoothing finds forces in its place, and doubts its values."""
     z = []
     for seed in range(3):
         log, truth = log_of(seed)
-        found = estimate_by(method, rig(mass=110.0), log)
-        assert found.status == "valid"
+        found = estimate_by("joint", rig(mass=110.0), log)
+        assert found.status == "valid", found.doubt
         assert np.abs(found.value / truth - 1).max() < 0.1
-        z.append(((found.value - truth) / found.std)[:honest])
+        z.append((found.value - truth) / found.std)
     assert np.abs(z).max() < 3.5
     assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.6
-    plain = estimate_by(method, rig(None, mass=110.0), log)
+    plain = estimate_by("joint", rig(None, mass=110.0), log)
     assert plain.relative_error_percent > 3 * found.relative_error_percent
-    assert np.abs(plain.value / truth - 1)[:2].max() > 0.2  # mass or viscous friction
+    assert plain.status in ("doubtful", "invalid")
+    assert np.nanmax(np.abs(plain.value / truth - 1)[:2]) > 0.05  # mass or viscous friction
 
 
 def test_what_was_commanded_before_a_stretch_is_left_out() -> None:

@@ -36,6 +36,7 @@ SEEDS = range(4)
 def arm(zero: Any = "sought", known_com: bool = True, mass: float = 1.0, **changes: Any) -> Model:
     """Two links whose centres of mass lie on their axes, or lie anywhere; mass: factor on the file's."""
     table: Any = copy.deepcopy(tomllib.loads(ARM.read_text()))
+    table["sampling_hz"]["value"] = 150  # at 50 Hz friction turns within one sample, which no linear smoother follows
     for body in table["body"]:
         com = body["inertia"]["com"]
         if known_com:
@@ -101,15 +102,14 @@ def test_forces_act_at_the_reading_less_the_zero(zero: float) -> None:
     assert read == pytest.approx(q)
 
 
-@pytest.mark.parametrize("method", ["wls", "joint"])
 @pytest.mark.parametrize("machine", [pendulum, arm])
-def test_hidden_zeros_are_found(machine: Any, method: str) -> None:
+def test_hidden_zeros_are_found(machine: Any) -> None:
     """From bodies 30 % too heavy; without the zero the centre of mass is off by many deviations, or the fit doubted."""
     truth, guess = machine(), machine(mass=1.3)
     z = []
     for seed in SEEDS:
         log = log_of(truth, seed)
-        found = estimate_by(method, guess, log)
+        found = estimate_by("joint", guess, log)
         assert found.status == "valid"
         at = guess.zeros
         z.append((found.value[at] - truth_of(truth)[at]) / found.std[at])
@@ -118,8 +118,8 @@ def test_hidden_zeros_are_found(machine: Any, method: str) -> None:
         assert np.abs(others).max() < 4.5
     assert np.abs(z).max() < 3.5
     assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.7
-    without = estimate_by(method, machine(zero=None, mass=1.3), log)
-    assert without.relative_error_percent > 1.2 * found.relative_error_percent
+    without = estimate_by("joint", machine(zero=None, mass=1.3), log)
+    assert without.status == "doubtful" or without.relative_error_percent > 1.2 * found.relative_error_percent
 
 
 def roller(**slip_limits: float) -> Model:
@@ -188,14 +188,14 @@ def test_a_roller_shows_the_zero_of_its_articulation() -> None:
     assert abs(found.value[-1] - HIDDEN[0]) < 3.5 * found.std[-1]
 
 
-@pytest.mark.parametrize("method", ["ols", "tls", "wls+consistent"])
-def test_other_linear_methods_find_zeros(method: str) -> None:
+@pytest.mark.parametrize("method", ["ols", "ols+consistent", "inverse"])
+def test_other_methods_find_zeros(method: str) -> None:
     truth, guess = arm(), arm(mass=1.3)
     found = estimate_by(method, guess, log_of(truth, 1))
     assert found.value[guess.zeros] == pytest.approx(HIDDEN, abs=0.005)
 
 
-@pytest.mark.parametrize("method", ["wls", "joint"])
+@pytest.mark.parametrize("method", ["ols", "joint"])
 def test_axis_along_gravity_says_that_no_log_shows_its_zero(method: str) -> None:
     model = arm(gravity=[0.0, 0.0, -9.81])
     found = estimate_by(method, model, log_of(model, 1))
@@ -206,7 +206,7 @@ def test_axis_along_gravity_says_that_no_log_shows_its_zero(method: str) -> None
     assert hidden_zeros(model) == {"q10": ()}
 
 
-@pytest.mark.parametrize("method", ["wls", "joint"])
+@pytest.mark.parametrize("method", ["ols", "joint"])
 def test_last_joint_shows_its_zero_only_together_with_the_centre_of_mass(method: str) -> None:
     model = arm(known_com=False)
     found = estimate_by(method, model, log_of(model, 1))
@@ -221,7 +221,7 @@ def test_what_is_known_of_a_zero_counts() -> None:
     model = arm({"value": 0.3, "source": "measured", "known": 0.01}, known_com=False)
     log = log_of(model, 1)
     assert log["q1_rad"].mean() == pytest.approx(log_of(arm(known_com=False), 1)["q1_rad"].mean() + 0.3)
-    found = estimate_by("wls", model, log)
+    found = estimate_by("ols", model, log)
     assert not found.unidentifiable
     k = model.base.names.index("q20")
     assert found.std[k] == pytest.approx(0.01, rel=1e-3)
@@ -262,7 +262,7 @@ def test_a_zero_that_a_log_hardly_shows_is_held() -> None:
     model = arm(known_com=False)
     log, rng = log_of(model, 1), np.random.default_rng(0)
     loud = log.assign(**{c: log[c] + 1.5 * rng.standard_normal(len(log)) for c in ("tau1_Nm", "tau2_Nm")})
-    found = estimate_by("wls", model, loud)
+    found = estimate_by("ols", model, loud)
     assert set(found.unidentifiable) == {"q10", "q20"}
     assert "hardly identifiable from this log: known to 0.0" in found.unidentifiable["q10"]
     assert found.names == model.base.names

@@ -14,8 +14,6 @@ from excite.model.machine import load_machine
 from excite.simulation import measure, simulate
 from excite.smoothing import cramer_rao
 
-EXACT = ("wls", "ols", "iv", "oe", "joint")
-
 
 def machine_file(tmp_path: Path, text: str, base: str = "emps") -> Path:
     path = tmp_path / "known.toml"
@@ -46,7 +44,13 @@ def both_ways() -> pd.DataFrame:
 OFFSET = '[body.carriage.friction]\nu0 = { value = -3.1648, source = "measured", known = true }\n'
 
 
-@pytest.mark.parametrize("method", EXACT)
+CORNER = pytest.mark.xfail(
+    reason="a smooth motion rounds the corner that dry friction makes where the drive begins, and tells it from offset",
+    strict=True,
+)
+
+
+@pytest.mark.parametrize("method", ["ols", "joint", pytest.param("inverse", marks=CORNER)])
 def test_known_offset_makes_dry_friction_identifiable(tmp_path: Path, one_way: pd.DataFrame, method: str) -> None:
     emps = build(load_machine("emps"))
     without = excite.identify("emps", one_way, method)
@@ -62,7 +66,7 @@ def test_known_offset_makes_dry_friction_identifiable(tmp_path: Path, one_way: p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [m for m in METHODS if m != "tls+consistent"])
+@pytest.mark.parametrize("method", [m for m in METHODS if m != "joint"])  # known to 0.3 ppm: where it ends makes more
 def test_known_mass_is_averaged_by_its_accuracy(tmp_path: Path, both_ways: pd.DataFrame, method: str) -> None:
     """As sure as the log and two standard deviations off: the result lies half way, 1 / sqrt(2) as uncertain."""
     alone = excite.identify("emps", both_ways, method)
@@ -75,7 +79,7 @@ def test_known_mass_is_averaged_by_its_accuracy(tmp_path: Path, both_ways: pd.Da
     assert found.status == alone.status
 
 
-@pytest.mark.parametrize("method", ["wls", "joint"])
+@pytest.mark.parametrize("method", ["inverse", "joint"])
 def test_contradicted_value_is_named(tmp_path: Path, both_ways: pd.DataFrame, method: str) -> None:
     text = (
         '[body.carriage.inertia]\nmass = { value = 90, source = "measured", known = 0.5 }\n'
@@ -136,7 +140,7 @@ def test_attainable_accuracy_counts_known_values(tmp_path: Path) -> None:
 
 
 def test_nothing_known_changes_nothing(both_ways: pd.DataFrame, tmp_path: Path) -> None:
-    plain = excite.identify("emps", both_ways, "wls")
+    plain = excite.identify("emps", both_ways, "ols")
     text = '[body.carriage.inertia]\nmass = { value = 95.1089, source = "measured", known = false }\n'
-    same = excite.identify(machine_file(tmp_path, text), both_ways, "wls")
+    same = excite.identify(machine_file(tmp_path, text), both_ways, "ols")
     assert (plain.value == same.value).all()

@@ -147,14 +147,17 @@ def test_a_vehicle_known_by_its_motor_controller_tells_ratios() -> None:
     v, current = (scipy.signal.filtfilt(b, a, np.interp(t, raw["ms_today"] / 1e3, raw[c])) for c in columns)
     W = np.column_stack([np.gradient(v, 1 / rate), v, np.tanh(v / 0.1), np.ones_like(v)])
     own = np.linalg.lstsq(W, current, rcond=None)[0]
-    for method, tolerance in (("ols", 0.03), ("wls", 0.12)):
+    found = {}
+    for method in ("ols", "inverse"):
         ready = prepare(model, [LIGHT_EV], needed_sensors(model, method))
-        estimate = identify(ready.model, ready.logs, method)
-        assert estimate.value[:2] == pytest.approx(own[:2], rel=tolerance)
+        found[method] = estimate = identify(ready.model, ready.logs, method)
         assert any("divided by that constant" in note for note in estimate.notes)
         low, high = estimate.interval95
         assert (low[2:] < 0).all()  # it only goes one way: dry friction and offset stay open
         assert (high[2:] > 0).all()
+    assert found["ols"].value[:2] == pytest.approx(own[:2], rel=0.03)
+    apart = found["inverse"].value - found["ols"].value
+    assert (np.abs(apart) < 3 * np.hypot(*(e.std_total for e in found.values()))).all()
 
 
 def test_the_command_reports_a_log_without_torque(excite: Excite, tmp_path: Path) -> None:

@@ -30,13 +30,13 @@ def other(straight: Model) -> Log:
 @pytest.fixture(scope="module")
 def found(straight: Model, straight_motion: Motion) -> dict[str, Estimate]:
     one = make_log(straight, straight_motion, seed=100)
-    return {m: methods.identify(straight, [one], m) for m in ("ols", "iv")}
+    return {m: methods.identify(straight, [one], m) for m in ("ols", "joint")}
 
 
 def test_truth_explains_an_exact_log(straight: Model, found: dict[str, Estimate]) -> None:
     motion = simulate(straight, drive(straight, 30, 7, {"u1": 1000, "u4": 1400}))
     exact = make_log(straight, motion, noise=False)
-    truth = replace(found["iv"], value=straight.nominal)
+    truth = replace(found["joint"], value=straight.nominal)
     assert validation.compare_motions(straight, exact, truth).percent.max() < 0.2
     assert validation.compare_torques(straight, exact, truth).percent.max() < 5
 
@@ -48,7 +48,7 @@ def test_what_a_torque_channel_adds_is_taken_away(straight: Model, found: dict[s
     flawed = build(placing.with_effects(straight.machine, *entries))
     motion = simulate(flawed, drive(flawed, 30, 7, {"u1": 1000, "u4": 1400}))
     exact = make_log(flawed, motion, noise=False)
-    truth = replace(found["iv"], names=flawed.base.names, value=flawed.nominal)
+    truth = replace(found["joint"], names=flawed.base.names, value=flawed.nominal)
     assert validation.compare_motions(flawed, exact, truth).percent.max() < 0.5
 
 
@@ -67,22 +67,22 @@ def test_what_is_far_from_the_machine_file_is_said(straight: Model, straight_mot
 
 def test_better_parameters_simulate_other_logs_better(straight: Model, found: dict[str, Estimate], other: Log) -> None:
     """Direct simulation tells a mass that is 5 % wrong; torques predicted from noisy slips do not."""
-    right, wrong = (validation.compare_motions(straight, other, found[m]) for m in ("iv", "ols"))
+    right, wrong = (validation.compare_motions(straight, other, found[m]) for m in ("joint", "ols"))
     assert right.names == ("theta1", "theta4", "thetal", "thetar")
     assert right.measured.shape == right.predicted.shape == (4, len(other))
     assert (right.percent < 0.6 * wrong.percent).all()
     assert right.percent.max() < 3
-    both = [validation.compare_torques(straight, other, found[m]) for m in ("iv", "ols")]
+    both = [validation.compare_torques(straight, other, found[m]) for m in ("joint", "ols")]
     assert both[0].names == ("u1", "u4")
     assert both[0].units == ("N m", "N m")
     assert both[0].percent.max() < 60
 
 
 def test_an_unknown_parameter_is_asked_for(straight: Model, found: dict[str, Estimate], other: Log) -> None:
-    value = found["iv"].value.copy()
+    value = found["joint"].value.copy()
     value[2] = np.nan
     with pytest.raises(ValueError, match="unknown: Fv1"):
-        validation.compare_motions(straight, other, replace(found["iv"], value=value))
+        validation.compare_motions(straight, other, replace(found["joint"], value=value))
 
 
 def test_emps_in_closed_loop(emps: Model, emps_data: Path) -> None:
@@ -145,7 +145,7 @@ def test_a_log_that_validates_nothing_is_said(
 
     def validate(name: str) -> tuple[int, str]:
         files = (tmp_path / "fitted.csv", "--validate", tmp_path / f"{name}.csv")
-        code, out, err = excite("identify", "va12_straight", *files, "--method", "wls", "--out", tmp_path / "out")
+        code, out, err = excite("identify", "va12_straight", *files, "--out", tmp_path / "out")
         return code, " ".join((out + err).split())
 
     code, said = validate("copy")

@@ -11,13 +11,22 @@ from support import damage, log_files
 from excite.errors import LogError
 from excite.logs import tables
 
-WANTED = ("t_s", "theta1_rad", "u1_Nm", "/joint_states/position[0]", "/motor/torque/data", "Encoder.Angle", "Angle")
+WANTED = (
+    "t_s",
+    "theta1_rad",
+    "u1_Nm",
+    "/joint_states/position[0]",
+    "/motor/torque/data",
+    "Encoder.Angle",
+    "Angle",
+    "X_Value",
+)
 SIZES = [pytest.param(1, id="few"), pytest.param(20, id="many", marks=pytest.mark.slow)]  # files of each format
 
 
 @pytest.fixture(scope="module")
 def child() -> Iterator[damage.Child]:
-    for library in ("rosbags", "mcap", "can", "cantools", "asammdf", "openpyxl", "h5py"):
+    for library in ("rosbags", "mcap", "can", "cantools", "asammdf", "openpyxl", "h5py", "nptdms", "pyulog"):
         pytest.importorskip(library, reason=f"{library} is not installed")
     made = damage.Child()
     yield made

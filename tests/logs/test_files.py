@@ -25,7 +25,8 @@ from support.log_files import (
 )
 
 from excite.errors import LogError
-from excite.logs import files, tables
+from excite.logs import tables
+from excite.logs.files import text
 
 MULTI_RATE: dict[str, tuple[Callable[[Path], Path], str, str]] = {
     "ROS 1": (write_bag1, "/joint_states/position[0]", "/motor/torque/data"),
@@ -246,7 +247,7 @@ def test_files_that_claim_too_much_are_refused(tmp_path: Path, monkeypatch: pyte
         file.create_dataset("t", shape=(10**12,), dtype="f8", chunks=(1000,))  # nothing stored
     with pytest.raises(LogError, match="far more than the file can hold"):
         tables.read_table(tmp_path / "log.h5")
-    monkeypatch.setattr(files.text, "MOST_BYTES", 10_000)
+    monkeypatch.setattr(text, "UNASKED_BYTES", 10_000)
     (tmp_path / "log.csv.gz").write_bytes(gzip.compress(b"a,b\n" + 100_000 * b"0,0\n"))
     with pytest.raises(LogError, match="unpacks to more than"):
         tables.read_table(tmp_path / "log.csv.gz")

@@ -64,7 +64,7 @@ def log() -> pd.DataFrame:
 
 def test_rotor_spring_and_current_are_identified_on_a_tilted_base(log: pd.DataFrame) -> None:
     model = build(arm())
-    estimate = excite.identify(model, log, method="wls")
+    estimate = excite.identify(model, log, method="inverse")
     found = dict(zip(estimate.names, estimate.value, strict=True))
     true = dict(zip(model.base.names, model.nominal, strict=True))
     assert {"Ia1", "Ks0"} <= set(found), "seen by itself: the second joint's rotor, the spring"
@@ -83,8 +83,8 @@ def test_a_payload_is_the_difference_of_two_estimates(log: pd.DataFrame) -> None
     case.pin.appendBodyToJoint(2, inertia, case.pin.frames[case.frames[1]].placement)
     case.data = case.pin.createData()
     model = build(arm())
-    unloaded = excite.identify(model, log, method="wls")
-    loaded = excite.identify(model, log_of(case), method="wls", unloaded=unloaded)
+    unloaded = excite.identify(model, log, method="inverse")
+    loaded = excite.identify(model, log_of(case), method="inverse", unloaded=unloaded)
     found = payload_parameters(model, loaded, unloaded)
     J = inertia.inertia - inertia.mass * pin.skew(inertia.lever) @ pin.skew(inertia.lever)
     moments = inertia.mass * inertia.lever
@@ -100,7 +100,7 @@ def test_a_payload_is_the_difference_of_two_estimates(log: pd.DataFrame) -> None
 
 def test_currents_without_a_constant_give_ratios_and_say_so(log: pd.DataFrame) -> None:
     model = build(arm(with_constant=False))
-    estimate = excite.identify(model, log, method="wls")
+    estimate = excite.identify(model, log, method="inverse")
     row = estimate.summary["parameters"]["Ks0"]
     assert row["unit"] == "A/rad"
     assert row["value"] == pytest.approx(STIFFNESS / CONSTANT, rel=0.01)

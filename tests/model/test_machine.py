@@ -36,6 +36,7 @@ def test_every_number_says_where_it_comes_from(name: str) -> None:
     """A number stands in a table with its source. Labels, counts of a filter and a lane's size are no data."""
     labels = {"index", "body", "antecedent", "lane_points", "order", "decimation", "drop", "lane_m", "gravity"}
     labels.add("time_offset")  # of a logger's clock
+    labels.add("ends")  # of a shape, whose radius says where both come from
 
     def bare(node: Any, key: str, where: str) -> list[str]:
         if isinstance(node, dict):
@@ -679,3 +680,30 @@ def test_another_table_is_another_machine(tmp_path: Path) -> None:
 def test_a_machine_is_also_built_from_data() -> None:
     machine = load_machine("va12")
     assert Machine.model_validate(machine.model_dump()) == machine
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda text: "".join(f"k{k} = 1\n" for k in range(60_000)) + text, "holds more than 50000 keys"),
+        (lambda text: "".join(f"k{k} = 1\n" for k in range(500)) + text, r"no such key here.*\(and 499 more\)"),
+        (lambda text: text + "\nreference_number = " + "9" * 5000, "not a TOML file: Exceeds the limit"),
+        (lambda text: "sampling_hz = { value = " + "9" * 4000 + ', source = "assumed" }\n' + text, "size between"),
+    ],
+)
+def test_a_flood_of_keys_or_digits_is_one_line(change: Callable[[str], str], words: str, tmp_path: Path) -> None:
+    path = tmp_path / "flood.toml"
+    path.write_text(change('extends = "emps"\nname = "flood"\n'))
+    with pytest.raises(MachineError, match=words) as err:
+        load_machine(path)
+    assert len(str(err.value)) < 2000
+
+
+def test_a_misspelt_machine_suggests_the_files_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_roller.toml").write_text("")
+    for wrong in ("my_rolller.toml", "my_roler"):
+        with pytest.raises(MachineError, match=r"did you mean my_roller\.toml\?"):
+            load_machine(wrong)
+    with pytest.raises(MachineError, match=r"did you mean va12\?"):
+        load_machine("va12x")

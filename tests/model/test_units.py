@@ -28,6 +28,7 @@ from excite.smoothing import cramer_rao
 HYDRAULIC = """
 extends = "va12"
 name = "hydraulic"
+noise_unit = "SI"
 time_column = "Time"
 time_unit = "ms"
 [[sensor]]
@@ -174,6 +175,7 @@ def test_what_does_not_fit_is_one_clear_line(tmp_path: Path, old: str, new: str,
 CYLINDERS = """
 extends = "va12"
 name = "cylinders"
+noise_unit = "SI"
 [[sensor]]
 name = "u2"
 kind = "torque"
@@ -313,6 +315,7 @@ radius = {{ value = 0.33, source = "assumed" }}
 RATES = """
 extends = "va12"
 name = "rates"
+noise_unit = "SI"
 """ + "".join(
     f"""
 [[sensor]]

@@ -544,8 +544,10 @@ def test_drive_command_writes_two_pages(excite: Excite, tmp_path: Path) -> None:
 
 
 def test_the_sheet_speaks_the_logger_s_units(va12: Model) -> None:
-    """Noise in the unit of the column: 0.002 rad/s are 0.115 deg/s."""
+    """Noise in the unit of the column, whatever unit the file gives it in: 0.002 rad/s are 0.115 deg/s."""
     rate = next(s for s in va12.machine.sensor if s.kind == "yaw_rate")
     assert sheet.sensor_line(va12.machine, rate).endswith("noise below 0.002 rad/s; optional")
     degrees = rate.model_copy(update={"unit": "deg/s"})
-    assert sheet.sensor_line(va12.machine, degrees).endswith("noise below 0.115 deg/s; optional")
+    assert sheet.sensor_line(va12.machine, degrees).endswith("noise below 0.002 deg/s; optional")
+    told = degrees.model_copy(update={"noise_unit": "rad/s"})
+    assert sheet.sensor_line(va12.machine, told).endswith("noise below 0.115 deg/s; optional")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
@@ -10,18 +12,29 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from excite import trajectories
 from excite.diagnosis import LogResiduals
 from excite.identification import Prediction, Verification
-from excite.logs import inspect, motion_columns, torque_column
+from excite.logs import SlipTable, inspect, motion_columns, torque_column
 from excite.model import Model, build, signal_descriptions
-from excite.model.machine import load_machine
-from excite.reports import diagnosis_figures, figures, text_faults, torque_figures
+from excite.model.machine import load_machine, shipped_machines
+from excite.reports import (
+    FigureFiles,
+    design_figures,
+    diagnosis_figures,
+    figures,
+    slip_figure,
+    text_faults,
+    top_view_figure,
+    torque_figures,
+    writing_figures,
+)
 from excite.simulation import measure, simulate
 
 LONG = "long names"
-MACHINES = ("va12", "emps", "tandem", "pendulum_loader")
+MACHINES = shipped_machines()
 
 
 def long_names() -> Model:
@@ -43,12 +56,12 @@ def design(model: Model) -> Figure:
     machine = model.machine
     torque = np.array([0.3 * float(b.limit.torque or 1.0) for b in machine.actuated]) * np.ones((201, 1))
     problem = machine.problems[str(machine.problem)] if machine.problem else next(iter(machine.problems.values()))
-    return figures.design_figure(model, problem, simulate(model, torque), f"{machine.title}: a drive")
+    return design_figures.design_figure(model, problem, simulate(model, torque), f"{machine.title}: a drive")
 
 
 def sigma(model: Model) -> Figure:
     values = dict(zip(model.base.names, np.geomspace(0.012, 250, len(model.base.names)), strict=True))
-    return figures.sigma_figure(values, model.machine.title)
+    return design_figures.sigma_figure(values, model.machine.title)
 
 
 def fit(model: Model) -> Figure:
@@ -81,11 +94,12 @@ def signals(model: Model) -> Figure:
 def verification(model: Model) -> Figure:
     n, runs = len(model.base.names), 20
     error = np.random.default_rng(1).normal(size=(runs, n)) * np.geomspace(1e-4, 0.3, n)
-    value, std = model.nominal * (1 + error), np.abs(model.nominal) * np.geomspace(1e-4, 0.3, n)
+    size = np.where(model.nominal != 0, np.abs(model.nominal), model.scale)
+    value, std = model.nominal + size * error, size * np.geomspace(1e-4, 0.3, n)
     ends = value[:, None] + 1.96 * std * np.array([-1, 1])[:, None]
     units = ("",) * n
     found = Verification(
-        "joint", "full", model.base.names, units, model.nominal, np.abs(model.nominal), value, 0 * value + std, ends, {}
+        "joint", "full", model.base.names, units, model.nominal, model.scale, value, 0 * value + std, ends, {}
     )
     return figures.verify_figure(found, f"{model.machine.title}: joint, kit full, 20 runs")
 
@@ -99,7 +113,7 @@ def comparison(model: Model) -> Figure:
         SimpleNamespace(name=name, cond_phi=17.0 * 3**k, worst_std_percent=0.8 * 2**k, breaks=broken if k % 2 else None)
         for k, name in enumerate(names)
     ]
-    return figures.compare_figure(rows, f"{machine.title}: designed and usual drives")  # type: ignore[arg-type]
+    return design_figures.compare_figure(rows, f"{machine.title}: designed and usual drives")  # type: ignore[arg-type]
 
 
 def prediction(model: Model, along_log: bool) -> Figure:
@@ -170,6 +184,45 @@ def torques(model: Model) -> Any:
     )
 
 
+def sensors(model: Model) -> Figure:
+    """A value for every change of the sensors of a kit."""
+    names = [s.name for s in model.machine.sensors("full")]
+    values = [
+        SimpleNamespace(sensor=n, change="ten times as accurate", worst_percent=0.5 + 0.1 * k, median_percent=0.2)
+        for k, n in enumerate(["as they are", *names])
+    ]
+    return design_figures.sensors_figure(values, f"{model.machine.title}, kit full")  # type: ignore[arg-type]
+
+
+def campaign(model: Model) -> Figure:
+    trials = [
+        {"drives": n, "duration_s": seconds, "percent": 300 / (n * seconds)} for n in (1, 2, 4) for seconds in (20, 60)
+    ]
+    summary = {"trials": trials, "target_percent": 0.9, "total_s": 240.0, "attained_percent": 0.8, "objective": "worst"}
+    return design_figures.campaign_figure(summary, f"{model.machine.title}: drives for 0.9 %")
+
+
+@dataclass(frozen=True)
+class Law:
+    name: str
+    parts: tuple[str, ...]
+    rms_left_out: float = 12.3
+
+    def forces(self, table: SlipTable) -> np.ndarray:
+        return np.stack([900 * table.slip, 300 * table.slip], axis=1)
+
+
+def slip(model: Model) -> Figure:
+    """Laws of a single-wheel test with traction and side force at two angles."""
+    s = np.linspace(0.02, 0.6, 12)
+    one = np.ones(12)
+    forces = {"traction": 900 * s, "side": 300 * s}
+    table = SlipTable("a.csv", one, 0 * s, one / (1 - s), 1e3 * one, forces, np.arange(12), "rim")
+    laws = [Law("linear", ()), *(Law(f"saturation + side force + speed {k}", ("x",)) for k in range(6))]
+    fit = SimpleNamespace(table=table, supported=laws[1:3], laws=laws, repeatability={"traction": 5.0})
+    return slip_figure(fit, None, f"{model.machine.title}: a_single_wheel_test.csv")  # type: ignore[arg-type]
+
+
 KINDS: dict[str, Callable[[Model], Figure]] = {
     "design": design,
     "sigma": sigma,
@@ -186,17 +239,28 @@ KINDS: dict[str, Callable[[Model], Figure]] = {
     "misfit": lambda m: missing(m, "misfit"),
     "when": lambda m: missing(m, "when"),
     "misfit of torques": lambda m: torque_figures.misfit_of_torques(torques(m), m.machine.title),
+    "sensors": sensors,
+    "campaign": campaign,
+    "top": lambda m: top_view_figure(m.machine),
+    "slip": slip,
     "curves": lambda m: torque_figures.curves_figure(torques(m), m.machine.title),
 }
 
 
 @pytest.mark.parametrize("machine", [LONG, *(pytest.param(name, marks=pytest.mark.slow) for name in MACHINES)])
+@pytest.mark.parametrize("width_mm", [88.0, pytest.param(180.0, marks=pytest.mark.slow), None])
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_text_is_cut_off_or_lies_on_another(kind: str, machine: str) -> None:
+def test_no_text_is_cut_off_or_lies_on_another(kind: str, width_mm: float | None, machine: str) -> None:
     model = model_of(machine)
-    if kind in ("design", "compare") and not model.machine.problems:
-        pytest.skip("has no design problem")
-    assert list(text_faults(KINDS[kind](model))) == []
+    if (kind in ("design", "compare") and not model.machine.problems) or (kind == "top" and not model.machine.planar):
+        pytest.skip("has no such figure")
+    with warnings.catch_warnings(), writing_figures(FigureFiles(width_mm=width_mm)):
+        warnings.simplefilter("error")  # a plot without room
+        figure = KINDS[kind](model)
+        assert list(text_faults(figure)) == []
+    scale = 1.0 if width_mm is None else width_mm / 25.4 / figure.get_figwidth()
+    letters = min(t.get_fontsize() for t in figure.findobj(Text) if t.get_text().strip())
+    assert scale * letters > (6.0 if width_mm else 8.0) - 0.01
 
 
 def test_the_check_finds_what_cannot_be_read() -> None:

@@ -17,7 +17,7 @@ from support.commands import Excite
 from excite.cli import terminal
 from excite.logs import profile as profiles
 from excite.model import Model
-from excite.reports import Picture, Table, charts, describe, figures, html, pages
+from excite.reports import COLOURS, Picture, Table, charts, describe, design_figures, html, pages, save
 from excite.simulation import Motion
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -28,7 +28,7 @@ VERSIONS = {"excite": "1", "numpy": "2"}
 def picture(tmp_path: Path) -> Path:
     figure = Figure(figsize=(6, 3))
     figure.subplots().plot([0, 1], [0, 1])
-    figures.save(figure, tmp_path / "design.png")
+    save(figure, tmp_path / "design.png")
     return tmp_path / "design.png"
 
 
@@ -149,7 +149,9 @@ def test_identify_reports_what_was_found(
         cells = (name, summary["meanings"][name], re.escape(row["unit"]), *numbers)
         assert re.search("".join(f"<td[^>]*>{cell}</td>" for cell in cells), text)
     assert summary["meanings"]["u10"] == "torque offset, front roll"
-    assert text.count('src="data:image/png;base64,') == 2  # torques, and the correlation of the errors
+    assert (
+        text.count('src="data:image/png;base64,') == 3
+    )  # torques, shares of each uncertainty, correlation of the errors
     assert f"for {tmp_path / 'log.csv'}. Each torque is predicted from the motion that the log shows" in text
     code, _, _ = excite("identify", "va12_straight", tmp_path / "log.csv", "--method", "ols", "--out", out)
     assert code == 0  # a folder with a report in it is ours and may be replaced
@@ -177,7 +179,7 @@ def test_what_a_method_errs_by_comes_first(excite: Excite, tmp_path: Path) -> No
 def _figures(model: Model, motion: Motion) -> list[Figure]:
     problem = model.machine.problems[str(model.machine.problem)]
     sigma = dict(zip(model.base.names, np.linspace(0.1, 5, len(model.base.names)), strict=True))
-    return [figures.design_figure(model, problem, motion, "t"), figures.sigma_figure(sigma, "t")]
+    return [design_figures.design_figure(model, problem, motion, "t"), design_figures.sigma_figure(sigma, "t")]
 
 
 def test_figures_have_units_and_line_styles_of_their_own(va12: Model, va12_motion: Motion) -> None:
@@ -201,7 +203,7 @@ def test_colours_differ_for_the_colour_blind() -> None:
         "protan": np.array([[0, 2.02344, -2.52581], [0, 1, 0], [0, 0, 1]]),
         "deutan": np.array([[1, 0, 0], [0.494207, 0, 1.24827], [0, 0, 1]]),
     }
-    rgb = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in figures.COLOURS[:4]]) / 255.0
+    rgb = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in COLOURS[:4]]) / 255.0
     for matrix in blind.values():
         seen = rgb**2.2 @ to_lms.T @ matrix.T @ np.linalg.inv(to_lms).T
         seen = np.clip(seen, 0, 1) ** (1 / 2.2)
@@ -267,8 +269,8 @@ def test_axes_without_anything_to_show_give_no_panel(caplog: pytest.LogCaptureFi
 def test_a_report_zooms_sorts_and_copies(browser: Any, va12: Model, va12_motion: Motion, tmp_path: Path) -> None:
     """In a browser: linked charts with values under the pointer, sortable tables, and no network; on paper pictures."""
     problem = va12.machine.problems[str(va12.machine.problem)]
-    figure = figures.design_figure(va12, problem, va12_motion, "t")
-    shown = figures.save(figure, tmp_path / "design.png")
+    figure = design_figures.design_figure(va12, problem, va12_motion, "t")
+    shown = save(figure, tmp_path / "design.png")
     panels = shown.panels
     assert [p.y_label for p in panels] == ["torque [% of limit]", "speed [m/s]", "angle [rad]", "largest slip [-]"]
     assert panels[1].curves[0].y == pytest.approx(va12_motion.nu[:, 0])
@@ -285,10 +287,12 @@ def test_a_report_zooms_sorts_and_copies(browser: Any, va12: Model, va12_motion:
     tab.on("console", lambda m: said.append(m.text) if m.type == "error" else None)
     tab.on("request", lambda r: said.append(r.url) if not r.url.startswith(("file:", "data:")) else None)
     tab.goto((tmp_path / "report.html").as_uri())
+    tab.locator(".zoom summary").click()  # the picture is shown once, its curves on request
     tab.wait_for_function("window.Bokeh && Bokeh.documents.length && Bokeh.documents[0].is_idle")
     ranges = "Bokeh.documents[0].roots()[0].children.map(c => [c[0].x_range.start, c[0].x_range.end])"
     before = tab.evaluate(ranges)
     assert len(before) == 4
+    tab.locator(".chart").evaluate("place => place.scrollIntoView()")
     box = tab.locator(".chart").bounding_box()
     tab.mouse.move(box["x"] + 300, box["y"] + 120)
     tab.mouse.down()

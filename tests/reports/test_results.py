@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -105,6 +106,26 @@ def test_numbers_as_a_table_have_units(results: dict[str, Shown], kind: str) -> 
 def test_the_table_of_a_log_is_a_log(straight: Model, results: dict[str, Shown]) -> None:
     again = ex.identify(straight, results["log"].to_frame(), "ols")
     assert again.value == pytest.approx(results["identify"].value)  # type: ignore[attr-defined]
+
+
+def test_a_parameter_is_taken_by_its_name(results: dict[str, Shown]) -> None:
+    estimate: Any = results["identify"]
+    assert estimate["M"]["value"] == estimate.value[estimate.names.index("M")]
+    with pytest.raises(UsageError, match="estimate: mass is unknown, allowed: M, "):
+        estimate["mass"]
+
+
+def test_a_model_prints_its_parameters(straight: Model) -> None:
+    head, names, *rows = str(straight).splitlines()
+    assert head == straight.machine.title
+    assert names.split()[:3] == ["parameter", "value", "unit"]
+    assert [row.split()[0] for row in rows] == list(straight.base.names)
+    assert len(repr(straight)) < 120
+
+
+def test_the_table_of_a_drive_is_a_drive(straight: Model, designed: ShownDesign) -> None:
+    by_table = ex.simulate(straight, designed.to_frame(), seed=1)
+    pd.testing.assert_frame_equal(by_table, ex.simulate(straight, designed.motion, seed=1), rtol=1e-5, atol=1e-5)
 
 
 COMMANDS: dict[str, Callable[[Path], tuple[object, ...]]] = {

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -16,22 +15,24 @@ from support.logs import make_log
 
 from excite import smoothing
 from excite.errors import LogError
-from excite.identification import identify, joint
+from excite.identification import identify
 from excite.logs import Log
 from excite.model import Model, prediction
 from excite.model.effects import placing
 from excite.model.machine import machine
 from excite.simulation import Motion, follow, simulate
 from excite.smoothing import (
+    PRIOR_STD,
     BatchedFunction,
-    Measurements,
-    StateSpace,
-    advance,
+    NotConvergedError,
+    Settings,
     build_state_space,
     common_sensors,
     differentiate,
-    gauss_newton,
+    fit_logs,
     initial_trajectory,
+    integrate,
+    newton_step,
     parallel_smoother,
     prepare_measurements,
     uncertainty,
@@ -184,25 +185,20 @@ def test_where_samples_lead_and_how_that_moves(va12: Model) -> None:
     c = build_state_space(va12, tuple(s.name for s in va12.machine.sensor))
     assert c.core == 7  # theta2 and six velocities: no roll's own angle, though the expressions hold it
     s = np.hstack([motion.q, motion.nu, motion.wheels])[:, c.index]
-    end = advance(c, s[:-1], motion.u[:-1], motion.u[1:], X)
-    assert np.abs(end - s[1:]).max() < 2e-6
-    by = differentiate(c, s, motion.u[:-1], motion.u[1:], X, force=True)
+    steps = integrate(c, s, motion.u[:-1], motion.u[1:], X)
+    assert np.abs(steps.end - s[1:]).max() < 2e-6
+    by = differentiate(c, steps, X, force=True)
     rng = np.random.default_rng(0)
-    ds, du, dX = rng.normal(size=c.n) * 1e-5, rng.normal(size=3) * 10, rng.normal(size=len(X)) * 1e-4 * va12.scale
+    ds, du, dX = rng.normal(size=c.n) * 1e-6, rng.normal(size=3), rng.normal(size=len(X)) * 1e-6 * va12.scale
     for a, b, d, moved in (
         (ds, 0 * du, 0 * dX, by.A @ ds),
         (0 * ds, du, 0 * dX, by.B @ du),
         (0 * ds, 0 * du, dX, by.X @ dX),
     ):
-        up = advance(c, s[:-1] + a, motion.u[:-1] + b, motion.u[1:] + b, X + d)
-        down = advance(c, s[:-1] - a, motion.u[:-1] - b, motion.u[1:] - b, X - d)
-        error, size = (up - down) / 2 - moved, (up - down) / 2
-        # A roll's spin forgets within a sample near standstill, and how much of it is left may be off; it hardly
-        # counts. What lasts, the angles, is right.
-        rms, typical = np.sqrt(np.mean(error**2, axis=0)), np.sqrt(np.mean(size**2, axis=0))
-        angles = [0, 7, 8, 9, 10]
-        assert (rms[angles] < 0.03 * typical[angles]).all()
-        assert (rms < 0.2 * np.maximum(typical, np.abs(a).max())).all()
+        up = integrate(c, s + a, motion.u[:-1] + b, motion.u[1:] + b, X + d).end
+        down = integrate(c, s - a, motion.u[:-1] - b, motion.u[1:] - b, X - d).end
+        error, size = np.sqrt(np.mean(((up - down) / 2 - moved) ** 2, axis=0)), np.sqrt(np.mean(moved**2, axis=0))
+        assert (error <= 1e-3 * size + 1e-12).all()  # stages are solved to about 1e-12
 
 
 @pytest.mark.slow
@@ -347,39 +343,19 @@ def undisturbed(va12: Model) -> np.ndarray:
 @pytest.mark.parametrize(
     ("nature", "amount"), [(sloping, 0.0005), (sloping, 0.002), (worn, 0.001)], ids=["slight", "slope", "wheel"]
 )
-def test_what_the_model_does_not_know_is_seen_in_the_innovations(
+def test_what_nobody_would_notice_on_site_is_within_the_intervals(
     va12: Model, undisturbed: np.ndarray, nature: Callable[[Model, float], Model], amount: float
 ) -> None:
-    """The exact model is brittle: what nobody would notice on site spoils it. It must say so, and still be near."""
+    """The exact model is brittle; a slope and a radius are within the tolerances of the file, or the log is doubted."""
     X = perturbed(va12, 1)
     real = nature(va12, amount)
     estimate = identify(va12, [measured(real, simulate(real, energetic(), X), X)], "joint")
-    assert estimate.status == "doubtful"
-    assert "more than their intervals" in estimate.doubt
-    assert "excite diagnose" in estimate.doubt
-    assert any("innovations" in note or "no estimate" in note for note in estimate.notes)
-    assert (estimate.std > undisturbed).all()
+    assert estimate.status == "valid" or "excite diagnose" in estimate.doubt
+    z = (estimate.value - X) / estimate.std_total
+    assert np.abs(z).max() < 4
+    assert np.sqrt(np.mean(z**2)) < 1.6
+    assert (estimate.std_total > undisturbed).all()
     assert np.median(np.abs(estimate.value - X) / np.maximum(np.abs(X), va12.scale)) < 0.03
-
-
-@pytest.mark.slow
-def test_an_estimate_that_is_drawn_in_says_so(va12: Model, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the unbiased way finds nothing, as on logs that hardly show anything: the steadier answer, and a note."""
-    exact = joint.fit_logs
-
-    def lost(c: StateSpace, records: Sequence[Measurements], *rest: Any, **more: Any) -> joint.Fit:
-        if records[0].unbiased:
-            raise joint.NotConvergedError("lost")
-        return exact(c, records, *rest, **more)
-
-    X = perturbed(va12, 6)
-    log = measured(va12, simulate(va12, energetic(), X), X, "full", 6)
-    known = identify(va12, [log], "joint")
-    monkeypatch.setattr(joint, "fit_logs", lost)
-    estimate = identify(va12, [log], "joint")
-    assert joint.BIASED_NOTE in estimate.notes
-    assert joint.BIASED_NOTE not in known.notes
-    assert (np.abs(estimate.value - known.value) < 2 * known.std).all()
 
 
 def test_spikes_are_taken_out_first(va12: Model) -> None:
@@ -447,25 +423,17 @@ def test_the_likelihood_is_followed_where_a_drive_shows_little(va12: Model) -> N
     starts = [initial_trajectory(c, records[0], log, va12.machine.filter)]
     n = len(va12.scale)
     free = np.zeros(n, bool)
-    fit = gauss_newton.fit_logs(c, records, starts, va12.nominal, starts, 0.0, free)
-    prior = np.full(n, gauss_newton.PRIOR_STD**-2)
-    covariance, *_ = gauss_newton.newton_step(c, records, fit.linear, fit.trajectories, fit.X, prior, 0.0)
+    fit = fit_logs(c, records, starts, va12.nominal, starts, free)
+    prior = np.full(n, PRIOR_STD**-2)
+    covariance, *_ = newton_step(c, records, fit.linear, fit.trajectories, fit.X, prior)
     k = va12.base.names.index("Ky4")
     way = (np.arange(len(covariance)) == k).astype(float)
     widths = uncertainty.profile_widths(c, records, starts, fit, covariance, way, free)
     for far, width in zip((-2.0, 2.0), widths, strict=True):
         X = fit.X + far * uncertainty.one_sigma_step(covariance, way)[:n] * va12.scale
         there = replace(va12, nominal=np.where(way[:n] > 0, X, va12.nominal))
-        held = gauss_newton.fit_logs(
-            replace(c, model=there),
-            records,
-            fit.trajectories,
-            X,
-            starts,
-            0.0,
-            way[:n] > 0,
-            damping=gauss_newton.RESUMED_DAMPING,
-        )
+        resumed = Settings(damping=0.25)
+        held = fit_logs(replace(c, model=there), records, fit.trajectories, X, starts, way[:n] > 0, settings=resumed)
         assert width == pytest.approx(2 / np.sqrt(held.cost - fit.cost), rel=0.05)
     assert max(widths) > 1.2 * min(widths)
     estimate = identify(va12, [log], "joint")
@@ -484,7 +452,7 @@ def test_the_likelihood_is_followed_beside_an_amount_at_its_end(va12: Model) -> 
         c = build_state_space(model, common_sensors(model, [log]))
         records = [prepare_measurements(c, log, unbiased=True)]
         starts = [initial_trajectory(c, records[0], log, model.machine.filter)]
-        fit = gauss_newton.fit_logs(c, records, starts, model.nominal, starts, 0.0, np.zeros(len(model.scale), bool))
+        fit = fit_logs(c, records, starts, model.nominal, starts, np.zeros(len(model.scale), bool))
         _, sides, _ = uncertainty.quantify_uncertainty(c, records, starts, fit)
         told.append(sides[:, model.base.names.index("Ky4")])
         added = [k for k, name in enumerate(model.base.names) if name not in va12.base.names]
@@ -513,10 +481,8 @@ def test_what_counting_does_to_an_estimate_is_foreseen(straight: Model) -> None:
                 angle[:, j] if step is None else step * np.floor(angle[:, j] / step + rng.uniform())
             )
         r = replace(prepare_measurements(c, log, unbiased=True), noise=noise, torque=torque)
-        fit = gauss_newton.fit_logs(c, [r], [start], straight.nominal, [start], 0.0, np.zeros(n, bool))
-        C, *_ = gauss_newton.newton_step(
-            c, [r], fit.linear, fit.trajectories, fit.X, np.full(n, gauss_newton.PRIOR_STD**-2), 0.0
-        )
+        fit = fit_logs(c, [r], [start], straight.nominal, [start], np.zeros(n, bool))
+        C, *_ = newton_step(c, [r], fit.linear, fit.trajectories, fit.X, np.full(n, PRIOR_STD**-2))
         own, white = uncertainty.encoder_error_moments(c, r, fit.trajectories[0], fit.X, fit.linear[0])
         errors.append((fit.X - straight.nominal) / straight.scale)
         foreseen.append(np.diag(C @ own @ C)[:n])
@@ -531,8 +497,8 @@ def test_readings_that_tell_nothing_of_a_parameter_are_no_estimate(straight: Mod
     """Far off, an iteration may come to where the information is singular: other starts are then tried."""
     sensors = tuple(s.name for s in straight.machine.sensor)
     space, none = build_state_space(straight, sensors), np.zeros(len(straight.nominal))
-    with pytest.raises(gauss_newton.NotConvergedError, match="covariance is not positive"):
-        gauss_newton.newton_step(space, [], [], [], straight.nominal, none, 1.0)
+    with pytest.raises(NotConvergedError, match="covariance is not positive"):
+        newton_step(space, [], [], [], straight.nominal, none)
 
 
 @pytest.mark.slow

@@ -140,6 +140,11 @@ class Score:
     gain_sure: bool | None = None
 
 
+def is_correction(finding: Mapping[str, Any]) -> bool:
+    """Tell if a finding only takes a share of a misfit whose cause has no name."""
+    return bool(finding.get("kind") == "correction")
+
+
 def score(one: Case, summary: Mapping[str, Any]) -> Score:
     """Judges the summary of `excite diagnose` (CONTRACT.md section 3). Raises KeyError where it lacks a key."""
     verdict, findings = summary["verdict"], summary["findings"]
@@ -155,8 +160,9 @@ def score(one: Case, summary: Mapping[str, Any]) -> Score:
         told = [{label.split("@")[0] for label in tie} & listed for tie in ties]
         return Score("tied" if any(told) and all(told) else "wrong", first, len(ties[0]) - 1)
     if one.kind in ("nothing", "surprise"):
-        # a partial name with the rest declared unexplained is still a name that somebody would act on
-        return Score("wrong", first, len(ties[0]) - 1)
+        # Corrections extend the model beside what stays unexplained; they are no names (CONTRACT.md section 3).
+        corrected = one.kind == "surprise" and verdict == "unexplained" and all(is_correction(f) for f in findings)
+        return Score("unexplained" if corrected else "wrong", first, len(ties[0]) - 1)
     hits = [k for k, tie in enumerate(ties) if tie & truth]
     exact = {name for name in names if name in truth}
     found = {h for h in truth if any(h in tie for tie in ties)}

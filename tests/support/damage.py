@@ -31,8 +31,8 @@ from excite.model import Model, prediction
 from excite.model.machine import load_machine
 
 LIBRARIES = ("asammdf", "can", "cantools", "h5py", "mcap.reader", "mcap_ros1.decoder", "mcap_ros2.decoder", "openpyxl")
-LIBRARIES += ("pyarrow.parquet", "rosbags.highlevel", "scipy.io")
-ROOM = 4 << 30  # bytes of address space
+LIBRARIES += ("nptdms", "pyarrow.parquet", "pyulog", "rosbags.highlevel", "scipy.io")
+ROOM = 4 << 30  # bytes of address space, most of which libraries reserve and never use
 SLOWEST = 20.0  # s for a file of 10 kB
 MOST_GROWTH = 600.0  # MB that reading a file of 10 kB may take
 HUGE = [
@@ -163,7 +163,7 @@ def _with_cell(line: str, between: str, column: int, cell: str) -> str:
 def damaged(path: Path, raw: bytes, rng: np.random.Generator) -> bytes:
     """A file changed as its format lets changes through: packed parts are changed inside as well."""
     suffix, inside = path.suffix, rng.random() < 0.6
-    if suffix in (".csv", ".tsv", ".txt", ".asc", ".dbc", ".yaml") and inside:
+    if suffix in (".csv", ".tsv", ".txt", ".asc", ".dbc", ".yaml", ".lvm", ".log") and inside:
         return damage_text(raw, rng)
     if suffix == ".gz" and inside:
         return gzip.compress(damage_text(gzip.decompress(raw), rng))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ T = np.arange(200) / 100
 ANGLE = np.sin(3 * T)
 TORQUE = 40 * np.cos(3 * T[::4])  # every fourth sample, 1 ms later
 T_TORQUE = T[::4] + 0.001
+U = 40 * np.cos(3 * T)
 NANOSECONDS = 1_795_341_600_000_000_000
 DBC = """VERSION ""
 NS_ :
@@ -110,6 +112,107 @@ def write_can(path: Path, suffix: str) -> Path:
     return path / f"log{suffix}"
 
 
+def write_candump(path: Path, style: str = "-l") -> Path:
+    """Frames as candump writes them: its log file, what it shows with times, or frames of CAN FD."""
+    cantools = pytest.importorskip("cantools", reason="cantools is not installed (extra can)")
+    base = cantools.database.load_string(DBC, "dbc")
+    frames = [(t, 256, base.encode_message(256, {"Angle": a, "Mode": 1})) for t, a in zip(T, ANGLE, strict=True)]
+    frames += [(t, 512, base.encode_message(512, {"Torque": u})) for t, u in zip(T_TORQUE, TORQUE, strict=True)]
+    frames += [(0.5, 0x7FF, b"unknown")]
+    lines = []
+    for t, name, data in sorted(frames):
+        between = "##1" if style == "FD" else "#"
+        shown = f"{name:03X}   [{len(data)}]  {data.hex(' ').upper()}"
+        where = "RX - -  " if style.endswith("-x") else ""
+        line = f" can0  {where}{shown}" if style.startswith("-t") else f"can0 {name:03X}{between}{data.hex().upper()}"
+        lines.append(f"({1e9 + t:.6f}) {line}")
+    path.write_text("\n".join([*lines, "(1000000002.000000) can0 100#R"]) + "\n")
+    return path
+
+
+def write_lvm(
+    path: Path, x: str, comma: str = ".", separator: str = "Tab", segments: int = 1, comments: bool = False
+) -> Path:
+    """A LabVIEW measurement file: x, its X_Columns; in so many segments, with a heading each if there are several."""
+    s = {"Tab": "\t", "Comma": ",", "Semicolon": ";"}[separator]
+    lines = ["LabVIEW Measurement", f"Writer_Version{s}2", f"Separator{s}{separator}", f"Decimal_Separator{s}{comma}"]
+    lines += [f"Multi_Headings{s}{'Yes' if segments > 1 else 'No'}", f"X_Columns{s}{x}", "***End_of_Header***", ""]
+    for part in np.array_split(np.arange(len(T)), segments):
+        late = T[part[0]]
+        lines += [f"Channels{s}2", f"Samples{s}{len(part)}{s}{len(part)}", s.join(["Date", *["2026/03/04"] * 2])]
+        lines += [s.join(["Time", *[f"10:11:{12 + late:.7f}"] * 2]), s.join(["Y_Unit_Label", "rad", "N m"])]
+        lines += [s.join(["X_Dimension", "Time", "Time"]), s.join(["X0", "0.0E+0", "0.0E+0"])]
+        lines += [s.join(["Delta_X", "0.010000", "0.010000"]), s.join(["***End_of_Header***", "", ""])]
+        head = {"One": ["X_Value", "Angle", "Torque"], "Multi": ["X_Value", "Angle", "X_Value", "Torque"]}
+        lines += [s.join([*head.get(x, ["X_Value", "Angle", "Torque"]), "Comment"])]
+        for k in part:
+            t, a, u = f"{T[k] - late:.6f}", f"{ANGLE[k]:.9f}", f"{U[k]:.9f}"
+            cells = {"One": [t, a, u], "Multi": [t, a, t, u], "No": ["", a, u]}[x]
+            lines.append(s.join(cells).replace(".", comma) + (f"{s}operator, tab" if comments and k == part[0] else ""))
+        lines.append("")
+    path.write_text("\r\n".join(lines))
+    return path
+
+
+def write_scope(path: Path, separator: str = "\t", comma: str = ".", filetime: bool = False, offset: int = 0) -> Path:
+    """An export of TwinCAT Scope: the angle every 10 ms, the torque every 40 ms and 1 ms later."""
+    s = separator
+    lines = ["Name" + s + "Scope Project", f"Starttime of export{s}133500000000000000{s}2026-03-04 10:11:12.000", ""]
+    block = [("Name", "Axis.Pos", "Axis.Torque"), ("SymbolComment", "", ""), ("Data-Type", "REAL64", "REAL64")]
+    block += [("SampleTime[ms]", "10", "10"), ("SymbolBased", "True", "True"), ("Unit", "rad", "Nm")]
+    block += [("Offset", "0", str(offset))]
+    lines += [s.join((key, a, key, b)) for key, a, b in block]
+    lines.append("")
+    for k in range(len(T)):
+        ms = [133500000000000000 + 1e7 * t if filetime else 1e3 * t for t in (T[k], T_TORQUE[min(k, 49)])]
+        at = [f"{m:.0f}" if filetime else f"{m:g}" for m in ms]
+        pair = (at[1], f"{TORQUE[k]:.9g}") if k < len(TORQUE) else ("", "")
+        lines.append(s.join((at[0], f"{ANGLE[k]:.9g}", *pair)).replace(".", comma))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_tdms(path: Path, waveforms: bool = True) -> Path:
+    nptdms = pytest.importorskip("nptdms", reason="npTDMS is not installed (extra tdms)")
+    start = np.datetime64("2026-03-04T10:11:12", "us")
+
+    def wave(first: float, step: float) -> dict[str, object]:
+        return {"wf_start_time": start, "wf_start_offset": first, "wf_increment": step, "unit_string": "rad"}
+
+    channels = [
+        nptdms.ChannelObject("rig", "angle", ANGLE, wave(0.0, 0.01) if waveforms else {}),
+        nptdms.ChannelObject("motor", "torque", TORQUE, wave(0.001, 0.04) if waveforms else {}),
+    ]
+    channels += [] if waveforms else [nptdms.ChannelObject("rig", "time", T)]
+    with nptdms.TdmsWriter(path / "log.tdms") as file:
+        file.write_segment(channels)
+    return path / "log.tdms"
+
+
+def write_ulog(path: Path, instances: int = 1) -> Path:
+    pytest.importorskip("pyulog", reason="pyulog is not installed (extra ulog)")
+
+    def message(kind: bytes, body: bytes) -> bytes:
+        return struct.pack("<HB", len(body), ord(kind)) + body
+
+    raw = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 5_000_000)
+    raw += message(b"B", bytes(40))
+    raw += message(b"F", b"rig:uint64_t timestamp;float angle;") + message(
+        b"F", b"motor:uint64_t timestamp;double torque;"
+    )
+    raw += b"".join(message(b"A", struct.pack("<BH", k, k) + b"rig") for k in range(instances))
+    raw += message(b"A", struct.pack("<BH", 0, 9) + b"motor")
+    data = [
+        (t, struct.pack("<HQf", k, 5_000_000 + round(1e6 * t), a))
+        for k in range(instances)
+        for t, a in zip(T, ANGLE, strict=True)
+    ]
+    data += [(t, struct.pack("<HQd", 9, 5_000_000 + round(1e6 * t), u)) for t, u in zip(T_TORQUE, TORQUE, strict=True)]
+    raw += b"".join(message(b"D", body) for _, body in sorted(data))
+    (path / "log.ulg").write_bytes(raw)
+    return path / "log.ulg"
+
+
 def write_mdf(path: Path, version: str = "4.10", suffix: str = ".mf4") -> Path:
     asammdf = pytest.importorskip("asammdf", reason="asammdf is not installed (extra mdf)")
     with asammdf.MDF(version=version) as mdf:
@@ -139,11 +242,19 @@ def a_file_of_each_format(folder: Path) -> dict[str, Path]:
         "MCAP unpacked": lambda p: write_mcap(p, compressed=False),
         "BLF": lambda p: write_can(p, ".blf"),
         "ASC": lambda p: write_can(p, ".asc"),
+        "LabVIEW": lambda p: write_lvm(p / "log.lvm", "Multi", segments=2),
+        "TwinCAT Scope": lambda p: write_scope(p / "log.csv"),
+        "TDMS": write_tdms,
+        "TDMS without waveforms": lambda p: write_tdms(p, waveforms=False),
+        "ULog": write_ulog,
         "MDF 4": write_mdf,
         "MDF 3": lambda p: write_mdf(p, "3.30", ".mdf"),
     }.items():
         (folder / name).mkdir()
         made[name] = write(folder / name)
+    (folder / "candump").mkdir()
+    write_can(folder / "candump", ".asc")
+    made["candump"] = write_candump(folder / "candump" / "log.log")
     made["DBC"] = made["ASC"].with_suffix(".dbc")
     (folder / "ROS 2").mkdir()
     bag = write_bag2(folder / "ROS 2")

@@ -22,6 +22,7 @@ from excite.model.machine import Problem, Quantity, machine
 from excite.simulation import Motion, simulate
 from excite.trajectories import (
     TOLERANCE,
+    BestSoFar,
     Design,
     Manoeuvre,
     check_limits,
@@ -57,7 +58,7 @@ def shorter(model: Model, seconds: float, **other: object) -> Problem:
     return problem.model_copy(update={"duration_s": duration, **other})
 
 
-SEEN: list[tuple[int, int, float]] = []  # progress of the design below
+SEEN: list[tuple[int, int, BestSoFar]] = []  # progress of the design below
 
 
 @pytest.fixture(scope="module")
@@ -120,6 +121,11 @@ def test_progress_shows_every_stage_and_the_best_so_far(quick: Design) -> None:
     assert done[-1] == 6
     assert list(best) == sorted(best, reverse=True)
     assert best[-1] == pytest.approx(quick.cond_phi, rel=1e-6)
+    told = [one.doing for one in best]
+    assert all(text.startswith("start 1 of 1, stage ") for text in told)
+    assert all(
+        ("no drive within all limits yet: " in text) == np.isinf(one) for text, one in zip(told, best, strict=True)
+    )
 
 
 def test_same_seed_same_design(straight: Model, quick: Design) -> None:

@@ -278,6 +278,7 @@ HYDRAULIC = {
     "factor": {"value": 4e6, "source": "assumed"},
     "displacement": {"value": 1.0e-3, "source": "assumed"},
     "noise": {"value": 35, "source": "assumed"},
+    "noise_unit": "SI",
 }
 SLIPS: dict[str, tuple[str, float | list[float], str]] = {  # key, its value in another unit, what is said
     "cc": ("sensor.7.displacement.value", 1000.0, "in cc?"),
@@ -399,7 +400,8 @@ def test_new_then_check(tmp_path: Path, excite: Excite) -> None:
     assert summary["usable"] is True
     assert summary["parameters"]["MX0R"]["what"] == "regrouped first moment x, front frame"
     assert summary["parameters"]["MX0R"]["stands_for"] == {"MX0": 1, "M2": -1.2, "M3": -1.2}
-    assert {p.name for p in out.iterdir()} == {"machine.png", "report.html", "summary.json"}
+    tables = {"wiring.csv", "log_template.csv"}
+    assert {p.name for p in out.iterdir()} == {"machine.png", "report.html", "summary.json", *tables}
     code, _, stderr = excite("machine", "new", "my_loader", "--out", path)
     assert code == 2
     assert "exists already" in stderr

@@ -146,7 +146,7 @@ WRONG = {
     "machine unknown": (GRID.replace("va12_straight", "va13"), "va13: no such machine, allowed: "),
     "machine missing": ("[grid]\nkit = 'full'", "grid[0].machine: is missing"),
     "kit unknown": (GRID + 'kit = "best"', "grid[0].kit[0]: must be 'paper' or 'full' (got 'best')"),
-    "method unknown": (GRID + 'method = "magic"', "method: magic is unknown, allowed: ols"),
+    "method unknown": (GRID + 'method = "magic"', "method: magic is unknown, allowed: inverse, ols"),
     "method without its sensors": (
         '[grid]\nmachine = "va12"\nmethod = "ols"\nkit = "paper"',
         "method: ols needs vy_m_s, which kit paper does not measure",

@@ -67,7 +67,7 @@ def test_an_estimate_moves_alike_in_the_urdf_that_is_written(arm_file: Path, tmp
     X = model.base_values(heavier)
     n = len(X)
     known = Estimate(
-        "wls",
+        "inverse",
         model.base.names,
         model.base.units,
         X,

@@ -1,9 +1,13 @@
-"""Logs of a CAN bus (BLF, ASC): columns by message and signal, as Motor.Torque, with the DBC file beside the log."""
+"""Logs of a CAN bus (BLF, ASC, candump): columns as Motor.Torque, by message and signal of the DBC file beside it."""
 
 from __future__ import annotations
 
+import itertools
+import re
 import struct
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +15,8 @@ import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
-from excite.logs.files.common import MOST_CELLS, NOTES, UNITS_SAID, lacking, merged, refuse_huge, said
+from excite.logs.files.common import NOTES, UNITS_SAID, Rows, merged, said
+from excite.logs.files.text import read_text
 from excite.text import count
 
 OBJECT = struct.Struct("<4sHHII")  # signature, bytes of the header, its version, bytes of the object, kind
@@ -19,27 +24,38 @@ CONTAINER = struct.Struct("<H6xL4x")  # method of compression, bytes unpacked
 CONTAINER_KIND = 10
 DEFLATE = 2  # method
 MOST_OF_CONTAINER = 100_000_000  # bytes; loggers fill them up to 128 kB; chosen
+FIRST_LINES = 100  # in which a frame is looked for
+STANDARD, EXTENDED, ERROR = 0x7FF, 0x1FFF_FFFF, 0x2000_0000  # bits of an identifier; linux/can.h
+STANDARD_DIGITS = 3  # of an identifier of 11 bits
+BYTES = r"(?P<data>(?:[0-9A-Fa-f]{2}[ .]?)*)"
+FRAME = re.compile(  # (1.5) can0 123#0011, 123##10011, 123#R and (1.5)  can0  RX - -  123   [2]  00 11
+    rf"\s*\((?P<time>\d+\.\d+)\)\s+(?P<channel>\S+)(?:\s+[TR]X)?(?:\s+[-BE]){{0,2}}\s+(?P<id>[0-9A-Fa-f]{{3,8}})"
+    rf"(?:\#R\d?|\#(?:\#[0-9A-Fa-f])?{BYTES}|\s+\[\d+\]\s+(?:remote request|{BYTES.replace('data', 'shown')}))"
+    r"(?:\s+(?:[TR]|'.*|ERRORFRAME))?\s*$"
+)
+UNTIMED = re.compile(r"\s*\w+\s+[0-9A-Fa-f]{3,8}\s+\[\d+\]\s")
 DATABASES = (".dbc", ".kcd", ".sym", ".arxml")
 
 
 def read_can(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     """Read the signals of all messages that the DBC file describes, each message at its own times."""
-    try:
-        import can
-        import cantools
-    except ImportError:
-        raise lacking(path, "CAN logs need python-can and cantools", "can") from None
+    dumped = path.suffix.lower() not in (".blf", ".asc")
+    if dumped and not is_candump(path):
+        return read_text(path, wanted)
+    import can
+    import cantools
+
     database = _database(path, cantools)
     if path.suffix.lower() == ".blf":
         _refuse_stuck(path)
     used = {w.rpartition(".")[0].strip().lower() for w in wanted} & {m.name.lower() for m in database.messages}
     known = {m.frame_id: m for m in database.messages if not used or m.name.lower() in used}
     times: dict[tuple[int, Any], list[float]] = {}
-    rows: dict[tuple[int, Any], list[dict[str, float]]] = {}
+    rows: dict[tuple[int, Any], Rows] = {}
     undecoded: dict[str, int] = {}
     notes: list[str] = []
-    cells = seen = 0
-    with can.LogReader(path) as log:
+    seen = 0
+    with _candump(path, notes) if dumped else can.LogReader(path) as log:
         try:
             for frame in log:
                 seen += 1
@@ -55,10 +71,7 @@ def read_can(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
                 numbers = {k: float(v) for k, v in signals.items() if isinstance(v, int | float)}
                 key = frame.arbitration_id, frame.channel
                 times.setdefault(key, []).append(float(frame.timestamp))
-                rows.setdefault(key, []).append(numbers)
-                cells += len(numbers)
-                if cells > MOST_CELLS // 8:  # objects take eight times the room of numbers
-                    refuse_huge(path, 8 * cells, 1)
+                rows.setdefault(key, Rows(path)).add(numbers)
         except LogError:
             raise
         except Exception as err:
@@ -78,15 +91,55 @@ def read_can(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
         message = known[key[0]]
         own = message.name if message.name not in taken else f"{message.name} (channel {key[1]})"
         taken.add(own)
-        frame_ = pd.DataFrame(found)
-        groups.append(
-            (np.array(times[key]) - first, {f"{own}.{name}": frame_[name].to_numpy(dtype=float) for name in frame_})
-        )
+        groups.append((np.array(times[key]) - first, {f"{own}.{n}": x for n, x in found.arrays().items()}))
         units |= {f"{own}.{s.name}": s.unit for s in message.signals if s.unit}
     table = merged(path, groups)
     kept = {name: unit for name, unit in units.items() if name in table.columns}
     table.attrs |= {UNITS_SAID: kept, NOTES: [*table.attrs.get(NOTES, []), *notes]}
     return table
+
+
+def is_candump(path: Path) -> bool:
+    """Tell if a file is what candump of can-utils writes, by the first line that is not blank."""
+    with path.open("rb") as file:
+        first = next((line for line in itertools.islice(file, FIRST_LINES) if line.strip()), b"")
+    return bool(FRAME.match(first.decode(errors="replace")) or UNTIMED.match(first.decode(errors="replace")))
+
+
+@contextmanager
+def _candump(path: Path, notes: list[str]) -> Iterator[Iterator[Any]]:
+    """Give the frames of candump's log file or of what it shows; what is no frame is noted. Raises LogError."""
+
+    def frames() -> Iterator[Any]:
+        import can
+
+        strange = 0
+        for line in file:
+            found = FRAME.match(line)
+            if found is None:
+                if UNTIMED.match(line):
+                    raise LogError(f"{path}: frames without times: record with `candump -l`, or `candump -t a`")
+                strange += bool(line.strip())
+                continue
+            at, channel, name = found.group("time", "channel", "id")
+            data = next((d for d in found.group("data", "shown") if d is not None), None)
+            extended = len(name) > STANDARD_DIGITS
+            mask = EXTENDED if extended else STANDARD
+            yield can.Message(
+                timestamp=float(at),
+                arbitration_id=int(name, 16) & mask,
+                is_extended_id=extended,
+                is_error_frame=bool(int(name, 16) & ERROR) and extended,
+                is_remote_frame=data is None,
+                data=bytes.fromhex((data or "").replace(".", "")),
+                is_fd=True,
+                channel=channel,
+            )
+        if strange:
+            notes.append(f"{count(strange, 'line is', 'lines are')} no frame, left out")
+
+    with path.open(encoding="utf-8", errors="replace") as file:
+        yield frames()
 
 
 def _refuse_stuck(path: Path) -> None:

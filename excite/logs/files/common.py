@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import logging
+import math
 import re
 import sys
 import warnings
+from array import array
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from io import StringIO
@@ -16,6 +20,7 @@ import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
+from excite.logs.formats import BAG_FOLDER
 from excite.text import count, format_number
 
 Reader = Callable[[Path, frozenset[str]], pd.DataFrame]  # of a file, and names of the columns that are wanted
@@ -28,15 +33,23 @@ OTHER_NAMES = "other_names"  # of a table's attrs: further names of columns -> t
 UNCLEAR = "unclear"  # of a table's attrs: what is said of columns whose numbers may be read in two ways
 LATE_S = 1.0  # [s] by which a message may be late; a clock that goes back further begins anew; chosen
 MOST_CELLS = 250_000_000  # numbers of a table, 2 GB: an hour at 1 kHz of 70 columns; chosen
+UNASKED_CELLS = 20_000_000  # numbers, 160 MB, that a small file may unpack to; chosen
 MOST_COLUMNS = 10_000  # of a table of cells; chosen
 MOST_BYTES = 2_000_000_000  # of unpacked text; chosen
 MOST_PACKED = 1_100  # times that a packed block can unpack to; zlib's most is 1032
 MOST_ELEMENTS = 64  # of an array in a message or a row that become columns of their own: no picture; chosen
+SHOWN = 3  # names that a note lists
+VECTOR = re.compile(r"\s*(?:array)?\(?\s*[\[({][-+\d.eE,;\s]*[\])}]\s*\)?\s*")  # [0.1, 0.2] or (0.1 0.2)
+NUMBERS = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+CHECKED_ROWS = 1000  # rows after which their number is looked at again
 WORDS = 120  # characters of a library's message that are shown
 
 
-def guarded(reader: Reader, kind: str) -> Reader:
-    """Make a reader whose library's errors, whatever they are, become one line of LogError. kind: "an MDF file"."""
+def guarded(reader: Reader, kind: str, extra: str) -> Reader:
+    """Make a reader whose library's errors, whatever they are, become one line of LogError.
+
+    kind: "an MDF file". extra: that brings the library.
+    """
 
     def read(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
         with quiet():
@@ -44,6 +57,8 @@ def guarded(reader: Reader, kind: str) -> Reader:
                 return reader(path, wanted)
             except LogError:
                 raise
+            except ModuleNotFoundError as err:
+                fault = f"{kind} needs {err.name}: pip install 'excite[{extra}]'"
             except MemoryError:
                 fault = "needs more memory than there is; is the file damaged?"
             except PermissionError as err:
@@ -86,18 +101,20 @@ def _ignore(_: object) -> None:
     """Say nothing of an error in a destructor."""
 
 
-def lacking(path: Path, what: str, extra: str) -> LogError:
-    """The error where a library is not installed."""
-    return LogError(f"{path}: {what}: pip install 'excite[{extra}]'")
-
-
 def refuse_huge(path: Path, rows: int, columns: int) -> None:
-    """Raises LogError where a file claims more than fits into memory."""
-    if rows * max(columns, 1) > MOST_CELLS:
+    """Raises LogError where a file claims more than fits into memory, or far more than its bytes can hold."""
+    cells = rows * max(columns, 1)
+    if cells > MOST_CELLS or (cells > UNASKED_CELLS and 8 * cells > MOST_PACKED * _size(path)):
         raise LogError(
             f"{path}: claims {count(rows, 'row')} of {count(columns, 'column')}, more than the {MOST_CELLS} numbers"
             " that are read; is the file damaged? otherwise cut it into shorter logs"
         )
+
+
+def _size(path: Path) -> int:
+    """Return the bytes of a file; of a bag's folder, or the file that describes it, those of all in it."""
+    folder = path if path.is_dir() else path.parent if path.name == BAG_FOLDER else None
+    return path.stat().st_size if folder is None else sum(p.stat().st_size for p in folder.iterdir() if p.is_file())
 
 
 def refuse_swollen(path: Path, claimed: int) -> None:
@@ -171,6 +188,77 @@ def merged(path: Path, groups: Sequence[tuple[np.ndarray, Mapping[str, np.ndarra
     frame = pd.DataFrame(table)
     frame.attrs[NOTES] = notes
     return frame
+
+
+class Rows:
+    """Rows of numbers by name, of which each may have some only, kept as columns: eight bytes a number."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.count = path, 0
+        self.columns: dict[str, array[float]] = {}
+
+    def add(self, row: Mapping[str, float]) -> None:
+        """Add a row. Raises LogError where they are more than fit into memory."""
+        for name, value in row.items():
+            column = self.columns.setdefault(name, array("d"))
+            if len(column) < self.count:
+                column.extend(itertools.repeat(math.nan, self.count - len(column)))
+            column.append(value)
+        self.count += 1
+        if not self.count % CHECKED_ROWS:
+            refuse_huge(self.path, self.count, len(self.columns))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the columns (N,), NaN in rows without a number."""
+        refuse_huge(self.path, self.count, len(self.columns))
+        for column in self.columns.values():
+            column.extend(itertools.repeat(math.nan, self.count - len(column)))
+        return {name: np.array(column) for name, column in self.columns.items()}
+
+
+def numbered(names: Sequence[str]) -> list[str]:
+    """Return names that differ: one that is there again gets a number, .1 for the second."""
+    made: dict[str, None] = {}
+    last: Counter[str] = Counter()
+    for k, name in enumerate(names):
+        own = new = name or f"Unnamed: {k}"
+        while new in made:
+            last[own] += 1
+            new = f"{own}.{last[own]}"
+        made[new] = None
+    return list(made)
+
+
+def name_the_same(names: Sequence[str], where: str) -> list[str]:
+    """Say which names of columns are there several times, and how `numbered` calls these."""
+    made, notes = numbered(names), list[str]()
+    for name, times in Counter(names).items():
+        if name and times > 1:
+            called = [own for own, n in zip(made, names, strict=True) if n == name]
+            notes.append(f"{where}: column {name} is there {times} times; by position: {', '.join(called[:SHOWN])}")
+    return notes
+
+
+def vectors_apart(table: pd.DataFrame) -> pd.DataFrame:
+    """Put lists of numbers in a cell, such as "[0.1, 0.2]", into columns of their own: name[0], name[1]."""
+    for name in [n for n in table.columns if table[n].dtype.kind in "OTU"]:
+        cells = table[name]
+        first = next((c for c in cells if isinstance(c, str) and c.strip()), "")
+        if not VECTOR.fullmatch(first):
+            continue
+        wide = len(NUMBERS.findall(first))
+        rows = [NUMBERS.findall(c) if isinstance(c, str) and VECTOR.fullmatch(c) else None for c in cells]
+        blank = cells.isna() | (cells.astype(str).str.strip() == "")
+        if 0 < wide <= MOST_ELEMENTS and all(
+            b if r is None else len(r) == wide for r, b in zip(rows, blank, strict=True)
+        ):
+            parts = np.array([[np.nan] * wide if r is None else r for r in rows], dtype=float)
+            place = list(table.columns).index(name)
+            attrs, table = table.attrs, table.drop(columns=name)
+            for k in reversed(range(wide)):
+                table.insert(place, f"{name}[{k}]", parts[:, k], allow_duplicates=True)
+            table.attrs = attrs
+    return table
 
 
 def unique_name(name: str, taken: set[str]) -> str:

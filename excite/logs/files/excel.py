@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import itertools
 import zipfile
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -16,31 +15,33 @@ from excite.errors import LogError
 from excite.logs.files import layout
 from excite.logs.files.common import (
     MOST_BYTES,
-    MOST_CELLS,
     MOST_COLUMNS,
     NOTES,
     OTHER_NAMES,
     UNITS_SAID,
     UNITS_UNKNOWN,
-    lacking,
+    name_the_same,
+    numbered,
     refuse_huge,
+    vectors_apart,
 )
 
 BEGIN = 200  # rows in which the header is looked for; chosen
 LONGEST = 1_048_576  # rows of a sheet: Excel's own limit
-OBJECT_ROOM = 8  # times the room of a number that a cell takes while it is read; measured
+UNASKED_BYTES = 50_000_000  # to which a small workbook may unpack; chosen
+MOST_TIMES = 60  # its own size to which a larger one may; tables of numbers do to 5 to 30 times; chosen
+BLOCK_CELLS = 500_000  # cells that are read before they become numbers
 NOT_BEFORE = datetime.datetime(1899, 12, 30)  # day 0 of Excel
 
 
 def read_excel(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     """Read the values of a sheet; cells of dates and times as these."""
-    try:
-        import openpyxl
-    except ImportError:
-        raise lacking(path, "Excel files need openpyxl", "xlsx") from None
+    import openpyxl
+
     with zipfile.ZipFile(path) as packed:
-        if sum(item.file_size for item in packed.infolist()) > MOST_BYTES:
-            raise LogError(f"{path}: unpacks to more than {MOST_BYTES // 10**9} GB; save it as CSV in shorter logs")
+        unpacked = sum(item.file_size for item in packed.infolist())
+    if unpacked > max(UNASKED_BYTES, min(MOST_TIMES * path.stat().st_size, MOST_BYTES)):
+        raise LogError(f"{path}: unpacks to {unpacked // 10**6} MB, more than is read; save it as CSV in shorter logs")
     book = openpyxl.load_workbook(path, read_only=True, data_only=True)
     best, most, count = None, -1, len(book.worksheets)
     try:
@@ -71,27 +72,45 @@ def _sheet(path: Path, sheet: Any) -> pd.DataFrame | None:
     if at is None:
         return None
     count = layout.width(at.names)
-    cells: list[tuple[Any, ...]] = []
-    for line in itertools.chain(begin[at.start :], lines):
-        cells.append(tuple(line[:count]) + (None,) * (count - len(line)))
-        if len(cells) > LONGEST:
+    blocks: list[list[pd.Series]] = []
+    rows_read, cells = 0, list[tuple[Any, ...]]()
+    for line in itertools.chain(begin[at.start :], lines, [None]):
+        if line is not None:
+            cells.append(tuple(line[:count]) + (None,) * (count - len(line)))
+            rows_read += 1
+        if cells and (line is None or len(cells) * count > BLOCK_CELLS):
+            blocks.append([_column([row[k] for row in cells]) for k in range(count)])
+            cells = []
+            refuse_huge(path, rows_read, count)
+        if rows_read > LONGEST:
             raise LogError(f"{path}: sheet {sheet.title} claims more than {LONGEST} rows; the file is damaged")
-        if len(cells) * count > MOST_CELLS // OBJECT_ROOM:
-            refuse_huge(path, OBJECT_ROOM * len(cells), count)
-    while cells and all(map(_blank, cells[-1])):
-        cells.pop()
+    columns = [_joined([block[k] for block in blocks]) for k in range(count)]
+    last = max((int(np.flatnonzero(c.notna())[-1]) for c in columns if c.notna().any()), default=-1)
+    columns = [c.iloc[: last + 1] for c in columns]
     names = at.names[:count]
-    twice = [name for name, times in Counter(names).items() if name and times > 1]
-    if twice:
-        raise LogError(f"{path}: sheet {sheet.title}, row {at.header + 1}: column {twice[0]} is there twice, keep one")
-    table = pd.DataFrame({name: _column([line[k] for line in cells]) for k, name in enumerate(names) if name})
+    called = numbered(names)
+    table = pd.DataFrame({called[k]: columns[k] for k, name in enumerate(names) if name})
+    table = vectors_apart(table)
     table.attrs |= {
-        NOTES: layout.left_out([cells if any(map(str.strip, cells)) else [] for cells in rows], at),
+        NOTES: name_the_same(names, f"sheet {sheet.title}, row {at.header + 1}")
+        + layout.left_out([cells if any(map(str.strip, cells)) else [] for cells in rows], at),
         UNITS_UNKNOWN: layout.unknown_units(names),
         UNITS_SAID: layout.bracketed_units(names) | at.units,
         OTHER_NAMES: layout.without_units(names) | at.other,
     }
     return table
+
+
+def _joined(parts: list[pd.Series]) -> pd.Series:
+    """Put the blocks of a column one after the other: numbers, dates or durations where all are, else cells."""
+    types = {p.dtype for p in parts if p.notna().any()}
+    if {t.kind for t in types} <= set("fiub"):
+        parts = [p.astype(float) for p in parts] if len({p.dtype for p in parts}) > 1 else parts
+    elif len(types) == 1:
+        parts = [p if p.notna().any() else pd.Series(index=p.index, dtype=next(iter(types))) for p in parts]
+    else:
+        parts = [p.astype(object) for p in parts]
+    return pd.concat(parts, ignore_index=True) if parts else pd.Series(dtype=float)
 
 
 def _blank(cell: Any) -> bool:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,25 +11,15 @@ import pandas as pd
 import scipy
 
 from excite.errors import LogError
-from excite.logs.files.common import (
-    MOST_ELEMENTS,
-    NOTES,
-    OTHER_NAMES,
-    lacking,
-    merged,
-    refuse_huge,
-    refuse_swollen,
-    said,
-)
+from excite.logs.files.common import MOST_ELEMENTS, refuse_huge, refuse_swollen, said
 from excite.logs.files.matlab5 import refuse_damaged
+from excite.logs.files.vectors import one_table
 
-TIMES = ("time", "t", "timestamps")  # fields that are the time of their struct
 VALUES = ("data", "values")  # fields that are the value of their struct: of a timeseries, of Simulink's signals
 LABELS = ("label", "name", "blockname")
 OBJECTS = ("timetable", "table", "timeseries", "datetime", "duration")  # classes that only MATLAB reads
 MOST_STRUCTS = 256  # elements of an array of structs that are looked into; chosen
 DEEPEST = 6  # structs in structs; chosen
-SHOWN = 3  # names that a message lists
 HDF5 = b"\x89HDF\r\n\x1a\n"
 MATLAB_HEADER = 512  # bytes before the HDF5 part of a .mat file
 
@@ -53,7 +41,7 @@ def read_matlab(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     for name, value in raw.items():
         if not name.startswith("__"):
             _walk(name, value, found, other, 0)
-    return _table(path, found, other, wanted, objects)
+    return one_table(path, found, other, wanted, objects)
 
 
 def _walk(name: str, value: Any, found: dict[str, np.ndarray], other: dict[str, str], depth: int) -> None:
@@ -92,10 +80,8 @@ def _add(name: str, value: np.ndarray, found: dict[str, np.ndarray]) -> None:
 
 def read_hdf5(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     """Read the vectors of an HDF5 file as group/name, of a MATLAB v7.3 file as name.field."""
-    try:
-        import h5py
-    except ImportError:
-        raise lacking(path, "MATLAB v7.3 and HDF5 files need h5py", "hdf5") from None
+    import h5py
+
     found: dict[str, np.ndarray] = {}
     objects: list[str] = []
     claimed = 0
@@ -132,65 +118,4 @@ def read_hdf5(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
                     _add(name, value.T if kind else value, found)
     ends = [(name, *name.rpartition(between)) for name in found]
     other = {own: name for name, own, dot, field in ends if dot and field.lower() in VALUES and own not in found}
-    return _table(path, found, other, wanted, objects)
-
-
-def _table(
-    path: Path, columns: dict[str, np.ndarray], other: dict[str, str], wanted: frozenset[str], objects: Sequence[str]
-) -> pd.DataFrame:
-    """Make one table of the columns that are wanted, or else of those of the length that most have."""
-    hint = "; save timetables and timeseries as structs, or with writetimetable" if objects else ""
-    if not columns:
-        raise LogError(f"{path}: holds no columns of numbers{hint}")
-    lengths = {name: len(values) for name, values in columns.items()}
-    notes = [f"objects of MATLAB are not read{hint}"] if objects else []
-    if len(set(lengths.values())) > 1:
-        series = _series(columns)
-        there = {name.strip().lower(): column for name, column in [*other.items(), *((n, n) for n in columns)]}
-        used = {there[w.strip().lower()] for w in wanted if w.strip().lower() in there}
-        sizes = {lengths[name] for name in used}
-        counts = Counter(lengths.values())
-        most = max(counts, key=lambda n: (counts[n], n))
-        of_series = {time for time, _ in series} | {name for _, members in series for name in members}
-        if series and (len(sizes) > 1 if used else counts[most] < len(columns) / 2) and used <= of_series:
-            return _merged(path, columns, series, other, notes)
-        if len(sizes) > 1 or (not used and counts[most] < 2):
-            listed = ", ".join(f"{k} {n}" for k, n in lengths.items() if k in (used or lengths))
-            raise LogError(
-                f"{path}: some variables are of another length than others ({listed}), they must be one table"
-            )
-        length = sizes.pop() if sizes else most
-        left = [name for name in columns if lengths[name] != length]
-        columns = {name: values for name, values in columns.items() if lengths[name] == length}
-        other = {name: column for name, column in other.items() if column in columns}
-        more = ", ..." if len(left) > SHOWN else ""
-        notes.append(f"variables of another length are not used: {', '.join(left[:SHOWN])}{more}")
-    refuse_huge(path, len(next(iter(columns.values()))), len(columns))
-    table = pd.DataFrame(columns)
-    table.attrs |= {NOTES: notes, OTHER_NAMES: other}
-    return table
-
-
-def _series(columns: Mapping[str, np.ndarray]) -> list[tuple[str, list[str]]]:
-    """Times and the columns that have them: vectors of the same struct, as long as its time."""
-    found = []
-    for time, t in columns.items():
-        end = max(time.rfind("."), time.rfind("/")) + 1
-        if end and time[end:].lower() in TIMES:
-            own = [n for n, v in columns.items() if n != time and n.startswith(time[:end]) and len(v) == len(t)]
-            found += [(time, own)] if own else []
-    return found
-
-
-def _merged(
-    path: Path,
-    columns: Mapping[str, np.ndarray],
-    series: list[tuple[str, list[str]]],
-    other: dict[str, str],
-    notes: list[str],
-) -> pd.DataFrame:
-    """Put time series of several lengths on all their times."""
-    table = merged(path, [(columns[t].astype(float), {n: columns[n] for n in members}) for t, members in series])
-    kept = {name: column for name, column in other.items() if column in table.columns}
-    table.attrs |= {NOTES: [*table.attrs.get(NOTES, []), *notes], OTHER_NAMES: kept}
-    return table
+    return one_table(path, found, other, wanted, objects)

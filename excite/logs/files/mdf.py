@@ -15,7 +15,6 @@ from excite.logs.files.common import (
     TIMESTAMPS,
     UNITS_SAID,
     columns_of_array,
-    lacking,
     merged,
     refuse_huge,
     refuse_swollen,
@@ -31,10 +30,8 @@ def read_mdf(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
 
     A cell is NaN where its channel has no sample, or one that the file marks as invalid. Units go to attrs["units"].
     """
-    try:
-        from asammdf import MDF
-    except ImportError:
-        raise lacking(path, "MDF files need asammdf", "mdf") from None
+    from asammdf import MDF
+
     groups: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
     units: dict[str, str] = {}
     taken = {TIMESTAMPS}

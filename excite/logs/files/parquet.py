@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
-from excite.logs.files.common import MOST_ELEMENTS, refuse_huge, said
+from excite.logs.files.common import MOST_ELEMENTS, NOTES, name_the_same, numbered, refuse_huge, said
 
 
 def read_parquet(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
@@ -35,15 +35,15 @@ def read_parquet(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     elif not isinstance(index, pd.RangeIndex) or index.start != 0 or index.step != 1:
         frame = frame.reset_index(drop=True)
     frame.columns = [".".join(map(str, name)) if isinstance(name, tuple) else str(name) for name in frame.columns]
-    if len(set(frame.columns)) < len(frame.columns):
-        twice = next(name for name in frame.columns if list(frame.columns).count(name) > 1)
-        raise LogError(f"{path}: column {twice} is there twice, keep one")
+    notes = name_the_same(list(frame.columns), "the file")
+    frame.columns = pd.Index(numbered(list(frame.columns)))
     columns: dict[str, Any] = {}
     for name in frame.columns:
         columns |= _plain(name, frame[name])
     attrs: dict[Any, Any] = {key: value for key, value in frame.attrs.items() if isinstance(key, str)}
     made = pd.DataFrame(columns, index=frame.index)
     made.attrs = attrs if all(isinstance(v, dict | list) for v in attrs.values()) else {}
+    made.attrs[NOTES] = [*made.attrs.get(NOTES, []), *notes]
     return made
 
 

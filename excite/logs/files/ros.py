@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from array import array
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,34 +13,28 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs.files.common import (
-    MOST_CELLS,
     MOST_ELEMENTS,
     NOTES,
     OTHER_NAMES,
-    lacking,
+    Rows,
     merged,
-    refuse_huge,
     said,
 )
 
 STAMP = "header.stamp"  # time column that stands for the stamp in each message's own header
 MCAP_MAGIC = b"\x89MCAP0\r\n"
+NAMES = ("name", "names", "joint_names", "interface_names")  # fields with the names of an array's elements
 DEEPEST = 8  # messages in messages; chosen
-OBJECT_ROOM = 8  # times the room of a number that a field takes while it is read; measured
 NANOSECONDS = 1_000_000_000
-NEED_ROSBAGS = "ROS bags need rosbags"
-NEED_MCAP = "MCAP files need mcap, mcap-ros1-support and mcap-ros2-support"
 
 Message = tuple[str, int, Any]  # topic, time of logging [ns], message
 
 
 def read_bag(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     """Read a .bag (ROS 1), a .db3 or the folder of a bag of ROS 2."""
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise lacking(path, NEED_ROSBAGS, "ros") from None
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
     bag = path.parent if path.is_file() and path.suffix != ".bag" and _in_bag(path) else path
     unknown: set[str] = set()
     with AnyReader([bag], default_typestore=get_typestore(Stores.LATEST)) as reader:
@@ -63,13 +58,11 @@ def _in_bag(path: Path) -> bool:
 
 def read_mcap(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     """Read an MCAP file with messages of ROS 1 or 2, or JSON; one that breaks off up to there."""
-    try:
-        from mcap.exceptions import McapError
-        from mcap.reader import NonSeekingReader, SeekingReader
-        from mcap_ros1.decoder import DecoderFactory as Ros1
-        from mcap_ros2.decoder import DecoderFactory as Ros2
-    except ImportError:
-        raise lacking(path, NEED_MCAP, "ros") from None
+    from mcap.exceptions import McapError
+    from mcap.reader import NonSeekingReader, SeekingReader
+    from mcap_ros1.decoder import DecoderFactory as Ros1
+    from mcap_ros2.decoder import DecoderFactory as Ros2
+
     notes: list[str] = []
     unknown: set[str] = set()
     decoders: dict[int, Any] = {}
@@ -115,41 +108,72 @@ def _topics(topics: set[str], wanted: frozenset[str]) -> set[str]:
     return {t for t in topics if any(name.startswith(t.lower().lstrip("/")) for name in names)} or topics
 
 
+class _Topic:
+    """What the messages of a topic hold: times [ns], a row of numbers each, and which element has which name.
+
+    elements: a column named by a joint -> the same one by its place, in the last message; moved: names have changed
+    their places along the log, or share them.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.times, self.rows = array("q"), Rows(path)
+        self.elements: dict[str, str] = {}
+        self.moved = False
+
+    def add(self, at: int, row: dict[str, float], elements: dict[str, str]) -> None:
+        """Add the numbers of a message."""
+        self.times.append(at)
+        self.rows.add(row)
+        if elements != self.elements and elements:
+            known = self.elements | elements
+            self.moved |= any(self.elements.get(n, k) != k for n, k in elements.items())
+            self.moved |= len(set(known.values())) < len(known)
+            self.elements = known
+
+    def columns(self, topic: str, notes: list[str]) -> dict[str, np.ndarray]:
+        """Return the columns of the topic: elements by place, by name where names have changed their places."""
+        columns = self.rows.arrays()
+        for name, place in self.elements.items():
+            unnamed = columns.pop(place, None)  # of messages without names
+            if not self.moved:
+                named = columns.pop(name)
+                columns[place] = named if unnamed is None else np.where(np.isnan(named), unnamed, named)
+        if self.moved:
+            notes.append(f"{topic}: names come in several orders; each message is read by its own names")
+        return columns
+
+
 def _table(
     path: Path, messages: Iterator[Message], wanted: frozenset[str], unknown: set[str], notes: list[str]
 ) -> pd.DataFrame:
     """Make one table of all messages, at the times of logging from the first on, or at those in their headers."""
-    times: dict[str, list[int]] = {}
-    rows: dict[str, list[dict[str, float]]] = {}
-    other: dict[str, str] = {}
-    cells, first = 0, None
+    topics: dict[str, _Topic] = {}
+    first: int | None = None
     for topic, at, message in messages:
         first = at if first is None else first
-        row: dict[str, float] = {}
-        _collect(topic, message, row, first, 0)
+        row, elements = dict[str, float](), dict[str, str]()
+        _collect(topic, message, row, first, 0, (), elements)
         if not row:
             continue
-        if topic not in rows:
-            other |= _joint_names(topic, message)
-        times.setdefault(topic, []).append(at)
-        rows.setdefault(topic, []).append(row)
-        cells += len(row)
-        if cells > MOST_CELLS // OBJECT_ROOM:
-            refuse_huge(path, OBJECT_ROOM * cells, 1)
+        topics.setdefault(topic, _Topic(path)).add(at, row, elements)
     if unknown:
         notes.append(f"messages of an unknown type are left out: {', '.join(sorted(unknown)[:3])}")
-    if first is None or not rows:
+    if first is None or not topics:
         raise LogError(f"{path}: no message with numbers{'; ' + notes[-1] if notes else ''}")
-    groups = []
-    for topic, found in rows.items():
-        t: np.ndarray = np.array([at - first for at in times[topic]], dtype=np.int64) / NANOSECONDS
-        frame = pd.DataFrame(found)
+    groups, other = [], dict[str, str]()
+    for topic, found in topics.items():
+        t: np.ndarray = (np.array(found.times) - first) / NANOSECONDS
+        columns = found.columns(topic, notes)
+        other |= {} if found.moved else found.elements
         if STAMP in wanted:
-            t = frame.get(f"{topic}/header/stamp", pd.Series(np.nan, frame.index)).to_numpy(dtype=float)
+            t = columns.get(f"{topic}/header/stamp", np.full(len(t), np.nan))
             if not np.isfinite(t).all():
                 notes.append(f"{topic}: has no stamp in a header, left out")
                 continue
-        groups.append((t, {str(name): frame[name].to_numpy(dtype=float) for name in frame}))
+            if found.moved:  # publishers whose stamps are not in the order of arrival
+                order = np.argsort(t, kind="stable")
+                t, columns = t[order], {name: values[order] for name, values in columns.items()}
+        groups.append((t, columns))
     if not groups:
         raise LogError(f"{path}: no message has a stamp in a header; write another time_column")
     table = merged(path, groups)
@@ -169,14 +193,32 @@ def _fields(value: Any) -> dict[str, Any]:
     return {name: getattr(value, name, None) for name in names if not name.startswith("_")}
 
 
-def _collect(name: str, value: Any, row: dict[str, float], first: int, depth: int) -> None:
-    """Collect the numbers of a message by name; a stamp as seconds since the first message."""
+def _collect(
+    name: str,
+    value: Any,
+    row: dict[str, float],
+    first: int,
+    depth: int,
+    names: tuple[str, ...],
+    elements: dict[str, str],
+) -> None:
+    """Collect the numbers of a message by name; a stamp as seconds since the first message.
+
+    names: of the elements of arrays, as the message that holds them gives them. elements: a column named by them -> the
+    same one by its place in the array.
+    """
     if isinstance(value, bool | int | float | np.number | np.bool_):
         row[name] = float(value)
     elif isinstance(value, np.ndarray | list | tuple):
         if len(value) <= MOST_ELEMENTS and depth < DEEPEST:
             for k, one in enumerate(value):
-                _collect(f"{name}[{k}]", one, row, first, depth + 1)
+                place = own = f"{name}[{k}]"
+                if len(names) == len(value):
+                    own = f"{name}[{names[k]}]"
+                before = len(row)
+                _collect(own, one, row, first, depth + 1, (), elements)
+                if own != place:
+                    elements |= {n: place + n[len(own) :] for n in list(row)[before:]}
     elif not isinstance(value, str | bytes | bytearray | memoryview) and value is not None and depth < DEEPEST:
         fields = _fields(value)
         numbers = [int(n) for n in fields.values() if isinstance(n, int | np.integer)]
@@ -184,19 +226,14 @@ def _collect(name: str, value: Any, row: dict[str, float], first: int, depth: in
             since = numbers[0] * NANOSECONDS + numbers[1]
             row[name] = (since - first if since > first // 2 else since) / NANOSECONDS  # a date, or a duration
             return
-        for field, one in fields.items():
-            _collect(f"{name}/{field}", one, row, first, depth + 1)
+        names = next((n for key in NAMES if (n := _names(fields.get(key)))), names)
+        for key, one in fields.items():
+            _collect(f"{name}/{key}", one, row, first, depth + 1, names, elements)
 
 
-def _joint_names(topic: str, message: Any) -> dict[str, str]:
-    """Names of the elements of a message's arrays by the names in it: /joint_states/position[shoulder]."""
-    fields = _fields(message)
-    names = fields.get("name", fields.get("joint_names"))
-    if not isinstance(names, list | tuple) or not all(isinstance(n, str) for n in names):
-        return {}
-    return {
-        f"{topic}/{field}[{n}]": f"{topic}/{field}[{k}]"
-        for field, values in fields.items()
-        if isinstance(values, np.ndarray | list | tuple) and values is not names and len(values) == len(names)
-        for k, n in enumerate(names)
-    }
+def _names(value: Any) -> tuple[str, ...]:
+    """Return the names of elements that a field holds, () where it holds none that differ."""
+    if not isinstance(value, list | tuple) or len(value) > MOST_ELEMENTS:
+        return ()
+    names = tuple(n for n in value if isinstance(n, str) and n)
+    return names if len(set(names)) == len(value) else ()

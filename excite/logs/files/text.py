@@ -15,8 +15,20 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs.files import layout
-from excite.logs.files.common import MOST_BYTES, MOST_COLUMNS, NOTES, OTHER_NAMES, UNCLEAR, UNITS_SAID, UNITS_UNKNOWN
+from excite.logs.files.common import (
+    MOST_BYTES,
+    MOST_COLUMNS,
+    NOTES,
+    OTHER_NAMES,
+    UNCLEAR,
+    UNITS_SAID,
+    UNITS_UNKNOWN,
+    name_the_same,
+    numbered,
+    vectors_apart,
+)
 from excite.logs.files.layout import COMMA, Layout, is_data, is_numeric, is_words
+from excite.logs.files.scopes import read_scope
 
 SEPARATORS = ("\t", ";", ",", "|")
 BLANKS = " "  # stands for any number of blanks between columns
@@ -33,6 +45,8 @@ DATE_ALONE = re.compile(r"\d{1,4}[-./]\d{1,2}[-./]\d{1,4}")
 CLOCK_ALONE = re.compile(r"\d{1,2}:\d{2}(:\d{2})?([.,:]\d+)?")
 ENOUGH = 200_000  # characters by which it is judged whether commas or points are decimal
 LONGEST = 500  # characters of a column's name: a line that has more is no header
+UNASKED_BYTES = 50_000_000  # to which a small file may unpack; chosen
+MOST_TIMES = 200  # its own size to which a larger one may; tables of numbers do to 3 to 100 times; chosen
 HEAD = 1_000_000  # bytes in which the header and the first rows are looked for; chosen
 TAIL = 100_000  # bytes in which the last rows are looked at; chosen
 SEEN = 100  # lines in which the data must begin; chosen
@@ -46,6 +60,9 @@ def read_text(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     """
     notes: list[str] = []
     raw = _utf8(path, _without_nuls(_bytes(path, notes), notes))
+    exported = read_scope(path, raw, notes)
+    if exported is not None:
+        return exported
     lines = _head(raw).split("\n")
     found, separator = _layout(path, lines)
     comment = lines[found.header].lstrip().startswith(COMMENTS)
@@ -57,11 +74,11 @@ def read_text(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     rows = [cells[k] if k in cells and k not in comments else [] for k in range(found.start)]
     notes += layout.left_out(rows, found)
     raw = raw[: _whole_rows(path, raw, found, separator, notes)]
-    counts = Counter(found.names)
-    twice = [name for name in counts for _ in range(counts[name] - 1)]
+    raw = _without_repeated_header(raw, lines, found, notes)
+    twice = [name for name, times in Counter(found.names).items() if times > 1]
     names: list[str] | None = None
     if comment or twice or separator == BLANKS:
-        names = _numbered(found.names)
+        names = numbered(found.names)
         body = raw[_offset(raw, found.start) :]
         if separator == BLANKS and _has_date_and_clock(body, len(names)):
             body = re.sub(rb"(?m)^([ \t]*\S+)[ \t]+", rb"\1T", body)
@@ -81,16 +98,22 @@ def read_text(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     table.columns = table.columns.astype(str).str.strip()
     if separator == BLANKS:
         _refuse_blank_cells(path, table, body)
-    if found.names and found.names[-1] == "" and table.iloc[:, -1].isna().all():  # a separator at the end of each line
-        table = table.iloc[:, :-1].copy()
-        twice = [name for name in twice if name or counts[""] > 2]
-    for name in dict.fromkeys(twice):
-        table = _one_of(path, table, name, found, notes)
+    unnamed = [k for k, name in enumerate(found.names) if not name and table.iloc[:, k].isna().all()]
+    if unnamed:  # a separator at the end of each line
+        table = table.drop(columns=table.columns[unnamed])
+    for name in filter(None, twice):
+        same = [n for n, own in zip(numbered(found.names), found.names, strict=True) if own == name]
+        if all(table[same[0]].equals(table[n]) for n in same[1:]):
+            notes.append(f"column {name} is there {len(same)} times with equal cells; one is kept")
+            table = table.drop(columns=same[1:])
+        else:
+            notes += name_the_same([n for n in found.names if n == name], f"line {found.header + 1}")
     unclear: dict[str, str] = {}
     for name in [n for n in table.columns if table[n].dtype.kind not in "biuf"]:
         if comma:
             table[name], unclear[name] = _without_commas(table[name], comma)
         table[name] = _dates(table[name])
+    table = vectors_apart(table)
     other = layout.without_units(found.names) | found.other
     table.attrs |= {
         UNITS_UNKNOWN: layout.unknown_units(found.names),
@@ -148,8 +171,8 @@ def _unpacked(path: Path, notes: list[str]) -> bytes:
                     raise LogError(f"{path}: not a gzip file that can be read: {err}") from None
                 parts.append(part)
                 size += len(part)
-                if size > MOST_BYTES:
-                    raise LogError(f"{path}: unpacks to more than {MOST_BYTES // 10**9} GB; cut it into shorter logs")
+                if size > max(UNASKED_BYTES, min(MOST_TIMES * path.stat().st_size, MOST_BYTES)):
+                    raise LogError(f"{path}: unpacks to more than {size // 10**6} MB; cut it into shorter logs")
                 piece = unpack.unconsumed_tail
                 if unpack.eof:
                     piece = unpack.unused_data.lstrip(b"\0")
@@ -333,27 +356,19 @@ def _no_header(path: Path, header: list[str], k: int) -> str:
     return ""
 
 
-def _numbered(names: list[str]) -> list[str]:
-    """Names that differ: a name that is there again gets a number."""
-    made: dict[str, None] = {}
-    last: Counter[str] = Counter()
-    for k, name in enumerate(names):
-        own = new = name or f"Unnamed: {k}"
-        while new in made:
-            last[own] += 1
-            new = f"{own}.{last[own]}"
-        made[new] = None
-    return list(made)
-
-
-def _one_of(path: Path, table: pd.DataFrame, name: str, found: Layout, notes: list[str]) -> pd.DataFrame:
-    """Keep one of the columns that share a name, where they are equal. Raises LogError where they aren't."""
-    same = [n for n, own in zip(_numbered(found.names), found.names, strict=True) if own == name and n in table.columns]
-    if not name or not all(table[same[0]].equals(table[n]) for n in same[1:]):
-        where = f"line {found.header + 1}: column {name or 'without a name'}"
-        raise LogError(f"{path}: {where} is there twice, keep one")
-    notes.append(f"column {name} is there {len(same)} times with equal cells; one is kept")
-    return table.drop(columns=same[1:])
+def _without_repeated_header(raw: bytes, lines: list[str], found: Layout, notes: list[str]) -> bytes:
+    """Leave out header lines, with what stands between them and the rows, that come again further down."""
+    between = [line for line in lines[found.header + 1 : found.start] if line.strip()]
+    begin = _offset(raw, found.start)
+    header = lines[found.header].rstrip(" \t").encode()
+    if not is_words(found.names) or raw.find(b"\n" + header, max(begin - 1, 0)) < 0:
+        return raw
+    again = rb"(?m)^" + re.escape(header) + rb"[ \t]*(?:\n|\Z)"
+    again += b"".join(b"(?:" + re.escape(line.encode()) + rb"(?:\n|\Z))?" for line in between)
+    body, times = re.subn(again, b"", raw[begin:])
+    if times:
+        notes.append(f"the header comes again {times} times among the rows; left out")
+    return raw[:begin] + body
 
 
 def _whole_rows(path: Path, raw: bytes, found: Layout, separator: str, notes: list[str]) -> int:

@@ -1,0 +1,214 @@
+"""Sizes of what a model lacks, by marginal likelihood.
+
+A linearised fit is a quadratic form in base parameters and coefficients. With these integrated out, the likelihood of
+the sizes is that of a linear Gaussian model. The logarithms of the sizes, over their typical values, scatter about a
+common level with SIZE_SCATTER: where something is lacking, so may others be that the logs tell less of. Source: MacKay,
+"Bayesian interpolation", Neural Computation 4, 1992.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from excite.smoothing.innovations import whiten
+from excite.smoothing.linearisation import StateSpace
+from excite.smoothing.log_fit import Fit, fit_with_unknown_forces, linearise_with
+from excite.smoothing.measurements import Measurements, Trajectory
+from excite.smoothing.solver import Settings, inverse
+from excite.smoothing.unknown_forces import UnknownForces, catalogue
+
+SIZE_SCATTER = 1.0  # standard deviation of the logarithm of a size about the common level: a factor of e
+CLEAN_LIKELIHOOD_RATIO = 8.0  # twice the log-likelihood that the common level must gain: one false alarm in 400 logs
+LEVELS = np.linspace(-7.0, 2.5, 20)  # logarithms of the common level that are tried
+PASSES = 60  # of the fixed point
+
+
+FIRST_FORCE_STD = 300.0  # [N, N m] of white forces in the first round, larger than what most logs need
+SLOWEST_SHRINKING = 0.4  # of a size from round to round, as shapes along a trajectory that still moves mislead
+FIRST_DAMPING = 1e4  # information of a parameter known to 1 % of its scale: sizes come first, then the parameters
+FORCES = ("lengthwise", "lateral", "turning")  # of a contact that are white, too
+# Rounds: sizes and shapes are renewed after each. Largest step that ends a round [standard deviations], and damping.
+ROUNDS = (
+    Settings(6, FIRST_DAMPING, 1.0, tolerance=0.3),
+    Settings(12, tolerance=0.2),
+    Settings(12, 0.25, tolerance=0.1),
+    Settings(12, 0.25, tolerance=0.05),
+)
+
+
+@dataclass(frozen=True)
+class FitBeside:
+    """A fit with unknown forces, and the measurements with the noise of torques that it found."""
+
+    fit: Fit
+    measurements: tuple[Measurements, ...]
+
+
+def fit_unknown_forces(
+    space: StateSpace,
+    measurements: Sequence[Measurements],
+    starts: Sequence[Trajectory],
+    held: np.ndarray,
+) -> FitBeside:
+    """Fit logs with what the model lacks, its sizes found."""
+    model, n_u = space.model, len(space.model.inputs)
+    white = np.array([FIRST_FORCE_STD * (kind in FORCES) for _, kind in space.forces])
+    X, trajectories, size = model.nominal, tuple(starts), None
+    inflation, logs, pull = np.ones(n_u), tuple(measurements), None
+    fit: Fit | None = None
+    for settings in ROUNDS:
+        unknown = catalogue(space, list(zip(logs, trajectories, strict=True)), X, white)
+        if size is None:
+            trajectories = _without_coefficients(trajectories, unknown)
+        else:
+            unknown = replace(unknown, size=size)
+        latest = fit_with_unknown_forces(
+            space, logs, trajectories, X, starts, held, unknown, settings=settings, probed=True, pull=pull
+        )
+        unmoved = any(t.force_error is None for t in latest.trajectories)
+        lost = unmoved or not latest.linear or not latest.cost > 0
+        fit = latest if fit is None or not lost else fit
+        if lost:
+            break
+        pull = fit.determinant
+        X, trajectories, found = fit.X, fit.trajectories, find_sizes(fit)[0].size
+        size = np.maximum(found, SLOWEST_SHRINKING * unknown.size)
+        ratio = white_noise_ratios(fit)
+        inflation = np.maximum(inflation * ratio[:n_u], 1.0)
+        logs = tuple(
+            replace(data, noise=replace(data.noise, torque=data.noise.torque * np.sqrt(inflation)))
+            for data in measurements
+        )
+        forced = white > 0
+        white = white.copy()
+        white[forced] *= np.where(
+            ratio[n_u:] < 1, np.maximum(ratio[n_u:], 0.1), np.sqrt(np.minimum(ratio[n_u:], 100.0))
+        )
+    assert fit is not None
+    spread = clustered_inflation(fit, float(model.machine.sampling_hz)) if fit.linear else np.ones(len(fit.X))
+    return FitBeside(replace(fit, covariance=fit.covariance * np.outer(spread, spread)), logs)
+
+
+CLUSTER_S = 2.0  # [s] of a log whose errors may belong together: a manoeuvre
+
+
+def clustered_inflation(fit: Fit, rate: float) -> np.ndarray:
+    """Return factors (n_base,), at least 1, on standard deviations for errors that belong together within CLUSTER_S.
+
+    What is still wrong is no white noise. The scores of a log's stretches show how much they do belong together
+    (sandwich of White, Econometrica 48 (1980) 817, over clusters).
+    """
+    covariance, n = inverse(fit.information), len(fit.X)
+    meat = np.zeros_like(covariance)
+    end = n + fit.unknown.count
+    for log, index in zip(fit.linear, fit.unknown.index, strict=True):
+        offsets = len(log.Z) - 2 - n - len(index)
+        own, end = np.r_[0:n, n + index, end : end + offsets], end + offsets
+        E = whiten(log).E[:, :, :-1]
+        score = np.einsum("kmc,km->kc", E[:, :, 1:], E[:, :, 0]).astype(float)
+        starts = np.arange(0, len(score), int(CLUSTER_S * rate))
+        stretches = np.zeros((len(starts), len(covariance)))
+        stretches[:, own] = np.add.reduceat(score, starts, axis=0)
+        meat += stretches.T @ stretches
+    clustered = covariance @ meat @ covariance
+    return np.sqrt(np.maximum(np.diag(clustered)[:n] / np.diag(covariance)[:n], 1.0))
+
+
+def lacks_forces(
+    space: StateSpace, measurements: Sequence[Measurements], starts: Sequence[Trajectory], held: np.ndarray, exact: Fit
+) -> bool:
+    """Tell if the marginal likelihood grows with any size of what the model lacks, about a fit of exact dynamics."""
+    if exact.cost < CLEAN_LIKELIHOOD_RATIO:  # of noiseless logs, of which more cannot be gained
+        return False
+    none = np.zeros(len(space.forces))
+    unknown = catalogue(space, list(zip(measurements, exact.trajectories, strict=True)), exact.X, none)
+    along = _without_coefficients(exact.trajectories, unknown)
+    fit = linearise_with(space, measurements, along, exact.X, starts, held | exact.unidentifiable, unknown)
+    return fit is not None and find_sizes(fit)[1] >= CLEAN_LIKELIHOOD_RATIO
+
+
+def _without_coefficients(trajectories: Sequence[Trajectory], unknown: UnknownForces) -> tuple[Trajectory, ...]:
+    """Set all coefficients of what is lacking along some trajectories to zero."""
+    logs = zip(trajectories, unknown.lacking, strict=True)
+    return tuple(replace(t, lacking=np.zeros(own.count), force_error=None) for t, own in logs)
+
+
+@dataclass(frozen=True)
+class _Coefficients:
+    """Information (n, n) and right side (n,) of the coefficients without their prior, all else integrated out."""
+
+    information: np.ndarray
+    right_side: np.ndarray
+    group: np.ndarray
+
+    def posterior(self, logs: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return mean and variance (n,), over the sizes, and twice the log-likelihood gained, for sizes exp(logs)."""
+        size = np.exp(logs)[self.group]
+        values, vectors = np.linalg.eigh(size[:, None] * self.information * size)
+        total = np.maximum(values, 0.0) + 1.0
+        pull = vectors.T @ (size * self.right_side)
+        mean = vectors @ (pull / total)
+        return mean, vectors**2 @ (1 / total), float(np.sum(pull**2 / total) - np.log(total).sum())
+
+
+def find_sizes(fit: Fit) -> tuple[UnknownForces, float]:
+    """Return what a fit lacks with its most likely sizes, and twice the log-likelihood that they gain.
+
+    All sizes are zero if a common level gains less than CLEAN_LIKELIHOOD_RATIO.
+    """
+    unknown = fit.unknown
+    own = _integrate_out_parameters(fit)
+    gains = [own.posterior(np.full(len(unknown.groups), level))[2] for level in LEVELS]
+    if max(gains) < CLEAN_LIKELIHOOD_RATIO:
+        return replace(unknown, size=np.zeros(len(unknown.groups))), max(gains)
+    level = float(LEVELS[int(np.argmax(gains))])
+    logs, count = np.full(len(unknown.groups), level), np.bincount(own.group)
+    for _ in range(PASSES):
+        mean, variance, _ = own.posterior(logs)
+        square = np.bincount(own.group, mean**2)
+        determined = count - np.bincount(own.group, variance)
+        slope = square - determined - 2 * (logs - level) / SIZE_SCATTER**2
+        logs = logs + np.clip(slope / (2 * determined + square + 2 / SIZE_SCATTER**2), -0.7, 0.7)
+    return replace(unknown, size=np.exp(logs)), own.posterior(logs)[2]
+
+
+def _integrate_out_parameters(fit: Fit) -> _Coefficients:
+    """Return the coefficients' quadratic form with base parameters and offsets integrated out."""
+    n, count, group = len(fit.X), fit.unknown.count, np.zeros(fit.unknown.count, int)
+    for k, own in enumerate(fit.unknown.groups):
+        group[own.every] = k
+    inner = np.arange(n, n + count)
+    outer = np.delete(np.arange(len(fit.information)), inner)
+    cross = fit.information[np.ix_(outer, inner)]
+    solved = np.linalg.solve(fit.information[np.ix_(outer, outer)], np.column_stack([cross, fit.right_side[outer]]))
+    information = fit.information[np.ix_(inner, inner)] - np.diag(fit.unknown.precision) - cross.T @ solved[:, :-1]
+    values, vectors = np.linalg.eigh((information + information.T) / 2)
+    information = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return _Coefficients(information, fit.right_side[inner] - cross.T @ solved[:, -1], group)
+
+
+def white_noise_ratios(fit: Fit) -> np.ndarray:
+    """Return the mean square of each white error, torques then forces with a size, over what a right model leaves.
+
+    The fit must be probed: what a draw of all noise leaves is the expectation. The square root corrects the noise.
+    """
+    slope, n_c = np.zeros(len(fit.right_side)), fit.unknown.count
+    n = len(fit.X)
+    indices, end = list[np.ndarray](), n + n_c
+    for log, index in zip(fit.linear, fit.unknown.index, strict=True):
+        offsets = len(log.Z) - 2 - n - len(index)
+        own = np.r_[0:n, n + index, end : end + offsets]
+        end += offsets
+        indices.append(own)
+        slope[own] += log.Z[1:-1, -1]
+    step = -np.linalg.solve(fit.information, slope)
+    found, expected = 0.0, 0.0
+    for log, own, trajectory in zip(fit.linear, indices, fit.trajectories, strict=True):
+        multipliers = log.chain.response(np.concatenate([[0.0], step[own], [1.0]]))[1][1:]
+        drawn = (log.gain.transpose(0, 2, 1) @ multipliers[:, :, None])[:, :, 0]
+        error = np.concatenate([trajectory.torque_error, trajectory.force_error], axis=1)[:, log.acting] / log.noise
+        found, expected = found + np.sum(error**2, axis=0), expected + np.sum(drawn**2, axis=0)
+    return np.asarray(found / np.maximum(expected, np.finfo(float).tiny))

@@ -1,0 +1,125 @@
+"""Folders as other programs and people leave them: a line each in the window, and no answer 500."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import socket
+import stat
+import threading
+import time
+from pathlib import Path
+from urllib.parse import quote, urlsplit
+
+import pytest
+
+from excite.app.day import Day
+
+pytest.importorskip("nicegui", reason="the extra app is not installed")
+
+DEEP = "[" * 100_000 + "]" * 100_000
+ODD = {
+    "list": "[1, 2]",
+    "number": "3",
+    "deep": DEEP,
+    "no_json": "{",
+    "columns_of_pandas": json.dumps({"columns": ["a", "b"], "index": [0]}),
+    "log_of_another_type": json.dumps({"columns": [], "log": 3, "faults": [], "doubts": []}),
+    "nul": json.dumps({"columns": {}, "log": "a\0b", "faults": [], "doubts": [], "machine": "va12"}),
+    "long": json.dumps({"columns": {}, "log": "a" * 5000, "faults": [], "doubts": [], "machine": "va12"}),
+    "findings": json.dumps({"findings": None, "machine": "va12", "logs": []}),
+    "phases": json.dumps({"phases": 1}),
+    "design": json.dumps({"cond_phi_start": 1, "machine": "va12", "worst_percent": "x"}),
+    "half_a_pair": '{"phases": "\\ud800"}',
+    "bytes": "\xff\xfe",
+}
+
+
+def folder(place: Path) -> Path:
+    results = place / "results"
+    for name, text in ODD.items():
+        (results / name).mkdir(parents=True)
+        (results / name / "summary.json").write_bytes(text.encode("latin-1") if name == "bytes" else text.encode())
+    for name in ("pipe", "here"):
+        (results / name).mkdir()
+    os.mkfifo(results / "pipe" / "summary.json")
+    os.mkfifo(results / "fifo.csv")
+    os.mkfifo(results / "fifo.toml")
+    (results / "folder.csv").mkdir()
+    foreign = {"machine": ["x"], "logs": ["a\0", "b" * 5000], "forms": [], "accepted": 3}
+    (results / "app.json").write_text(json.dumps(foreign))
+    return results
+
+
+def test_what_no_step_can_show_is_a_line(tmp_path: Path) -> None:
+    day = Day(folder(tmp_path))
+    with day.glance():
+        lines = "\n".join(day.passed_over)
+    for name in (*(n for n in ODD if n not in ("number", "list")), "pipe", "fifo.csv", "fifo.toml", "folder.csv"):
+        assert f"/{name}" in lines, name
+    assert all(len(line) < 500 for line in day.passed_over)
+    assert day.known_logs() == []
+    assert day.results() == []
+
+
+def test_choices_of_another_type_are_left_out(tmp_path: Path) -> None:
+    kept = {"forms": {"design": {"starts": "x", "budget": 20, "driver": 1, "objective": "accuracy"}}}
+    (tmp_path / "app.json").write_text(json.dumps(kept))
+    form = Day(tmp_path).forms["design"]
+    assert (form["starts"], form["budget"], form["driver"], form["objective"]) == (2, 20, False, "accuracy")
+
+
+def request(address: str, method: str, path: str, body: bytes | None = None) -> tuple[int, str]:
+    at = urlsplit(address)
+    link = http.client.HTTPConnection(at.hostname, at.port, timeout=60)
+    link.request(method, at.path + path, body)
+    got = link.getresponse()
+    return got.status, got.read().decode(errors="replace")
+
+
+def test_the_server_never_answers_500(tmp_path: Path) -> None:
+    from test_window import window
+
+    results = folder(tmp_path)
+    with window(tmp_path) as (address, _):
+        code, page = request(address, "GET", "")
+        assert code == 200
+        assert "it is not shown" in page
+        for odd in ("a" * 5000, "a%00b", "fifo.csv", "pipe/summary.json", "%ff%fe", "a/" * 2000):
+            assert request(address, "GET", f"files/{odd}")[0] in (404, 414), odd
+        for odd in ("a" * 5000 + ".csv", "a%00b.csv", "x.exe", "x", ".csv", "machine.toml", "x.TOML"):
+            code, said = request(address, "POST", f"log/{odd}", b"t_s\n0\n")
+            assert code in (400, 404, 414), (odd, code, said)
+        assert request(address, "POST", "log/fifo.csv", b"x")[0] == 409
+        at = urlsplit(address)
+        with socket.create_connection((at.hostname, at.port)) as half:  # a reader that goes away
+            head = f"POST {at.path}log/half.csv HTTP/1.1\r\nHost: {at.netloc}\r\nContent-Length: 1000000\r\n\r\n"
+            half.sendall(head.encode() + b"t_s\n" * 100)
+        time.sleep(0.5)
+        assert request(address, "POST", f"log/{quote('drive 1.csv')}", b"t_s\n0\n")[0] == 200
+        assert request(address, "POST", f"log/{quote('drive 1.csv')}", b"other")[0] == 409
+        assert (results / "drive 1.csv").read_bytes() == b"t_s\n0\n"
+        assert not (results / "half.csv").exists()
+
+        codes: list[int] = []
+
+        def hand_over(letter: bytes) -> None:
+            codes.append(request(address, "POST", "log/both.csv", letter * 3_000_000)[0])
+
+        both = [threading.Thread(target=hand_over, args=(letter,)) for letter in (b"a", b"b")]
+        for one in both:
+            one.start()
+        for one in both:
+            one.join()
+        assert sorted(codes) == [200, 409]
+        assert request(address, "GET", "")[0] == 200
+
+
+def test_the_browser_is_led_by_a_file_that_nobody_else_can_read(tmp_path: Path) -> None:
+    from excite.app import server
+
+    door = server._redirect(tmp_path, "http://127.0.0.1:1/secret/")
+    assert stat.S_IMODE(door.stat().st_mode) == 0o600
+    assert "secret" in door.read_text()
+    assert "secret" not in str(door)

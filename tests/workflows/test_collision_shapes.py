@@ -1,0 +1,104 @@
+"""Shapes from the collision geometry of a URDF hold it, by pinocchio's own placement of the same geometry."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from excite.cli import machine_template
+from excite.model import build
+from excite.model.machine import load_machine
+from excite.model.mechanics import body_poses
+from excite.trajectories import machine_limits
+from excite.workflows import choose_problem
+from excite.workflows.collision_shapes import capsules_around
+
+ARM = Path(__file__).parents[1] / "support" / "arm.urdf"
+SHAPES = {  # collision geometry by link
+    "base_link": '<geometry><box size="0.2 0.2 0.1"/></geometry>',
+    "Upper-Arm": '<origin xyz="0.2 0 0.1" rpy="0 1.57 0"/><geometry><cylinder radius="0.05" length="0.4"/></geometry>',
+    "hand": '<origin xyz="0 0.1 0" rpy="0.4 0 0"/><geometry><box size="0.1 0.3 0.05"/></geometry>',
+}
+
+
+def inside(points: np.ndarray, shapes: list[tuple[np.ndarray, float]]) -> np.ndarray:
+    """Depth [m] of points in the union of capsules, negative outside."""
+    depths = []
+    for ends, radius in shapes:
+        along = ends[-1] - ends[0]
+        share = np.clip((points - ends[0]) @ along / max(float(along @ along), 1e-12), 0, 1)
+        depths.append(radius - np.linalg.norm(points - ends[0] - share[:, None] * along, axis=1))
+    return np.max(depths, axis=0)
+
+
+def test_few_capsules_hold_an_elbow_without_filling_it() -> None:
+    """Two tubes at a right angle: one capsule around both has eight times the volume."""
+    import trimesh
+
+    tubes = [
+        trimesh.creation.cylinder(0.05, segment=((0, 0, 0), (0.5, 0, 0))),
+        trimesh.creation.cylinder(0.05, segment=((0.5, 0, 0), (0.5, 0, 0.5))),
+    ]
+    triangles = [
+        np.asarray(v)[f] for v, f in (trimesh.remesh.subdivide_to_size(t.vertices, t.faces, 0.03) for t in tubes)
+    ]
+    found = capsules_around(np.concatenate(triangles))
+    assert len(found) == 2
+    shapes = [(c.ends, c.radius) for c in found]
+    assert inside(np.concatenate(triangles).reshape(-1, 3), shapes).min() > -1e-6
+    assert sum(c.volume for c in found) < 2.5 * sum(t.volume for t in tubes)
+
+
+def test_shapes_of_a_urdf_hold_its_collision_geometry_in_every_pose(tmp_path: Path) -> None:
+    text = ARM.read_text()
+    robot = text.replace("<link", "\n<link")
+    links = [link for link in SHAPES if f'<link name="{link}"' in robot]
+    for link in links:
+        start = robot.index(f'<link name="{link}"')
+        end = robot.index(">", start)
+        closed = robot[end - 1] == "/"
+        body = f"<collision>{SHAPES[link]}</collision>"
+        robot = robot[: end - closed] + ">" + body + ("</link>" if closed else "") + robot[end + 1 :]
+    assert links
+    urdf, file = tmp_path / "arm.urdf", tmp_path / "arm.toml"
+    urdf.write_text(robot)
+    machine_template.start("arm", file, origin=str(urdf))
+    machine = load_machine(file)
+    twin = pin.buildModelFromUrdf(str(urdf))
+    geometry = pin.buildGeomFromUrdf(twin, str(urdf), pin.GeometryType.COLLISION)
+    data, placed = twin.createData(), geometry.createData()
+    rng = np.random.default_rng(0)
+    joints = [s.column.rsplit("_", 1)[0] for s in machine.sensor if s.kind == "angle"]
+    for _ in range(5):
+        step, q = np.zeros(twin.nv), {}
+        for name, body in zip(joints, machine.body, strict=True):
+            q[body.coordinates[0]] = step[twin.joints[twin.getJointId(name)].idx_v] = rng.uniform(-1, 1)
+        pin.updateGeometryPlacements(twin, data, geometry, placed, pin.integrate(twin, pin.neutral(twin), step))
+        poses = body_poses(machine, q)
+        shapes = [(np.array(s.ends), float(s.radius)) for s in machine.world.shape]
+        for body in machine.body:
+            R, P = poses[body.index]
+            shapes += [(np.array(s.ends) @ R.T + P, float(s.radius)) for s in body.shape]
+        for one, at in zip(geometry.geometryObjects, placed.oMg, strict=True):
+            half = getattr(one.geometry, "halfSide", None)
+            size = half if half is not None else np.array([one.geometry.radius] * 2 + [one.geometry.halfLength])
+            corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T * size
+            if half is None:
+                corners[:, :2] /= np.sqrt(2)
+            assert inside(corners @ at.rotation.T + at.translation, shapes).min() > -1e-4
+    model = build(machine)
+    assert any(g.kind == "clearance" for g in machine_limits(model, choose_problem(machine, None, None)[1]))
+
+
+def test_a_mesh_that_is_missing_is_said_in_the_file(tmp_path: Path) -> None:
+    text = ARM.read_text()
+    link = "Upper-Arm"
+    start = text.index(">", text.index(f'<link name="{link}"')) + 1
+    mesh = '<collision><geometry><mesh filename="package://robots/nothing.stl"/></geometry></collision>'
+    urdf, file = tmp_path / "arm.urdf", tmp_path / "arm.toml"
+    urdf.write_text(text[:start] + mesh + text[start:])
+    machine_template.start("arm", file, origin=str(urdf))
+    assert "the collision mesh package://robots/nothing.stl is not there" in file.read_text()
+    assert not any(b.shape for b in load_machine(file).body)
