@@ -382,7 +382,7 @@ def fit_from_start(
 
 
 def _fit_exact_from_start(data: FitData) -> FitPair | None:
-    """Fit exact dynamics from initial trajectories; None if they stay LOST_COST_RATIO off."""
+    """Fit exact dynamics from initial trajectories; None if that does not settle below LOST_COST_RATIO."""
     fit = fit_from_start(data, 0.0, LOST_COST_RATIO * data.n_readings, patient=True)
     return None if fit is None else (fit, None)
 
@@ -446,7 +446,7 @@ def refit_all(
     cost_limit: float = np.inf,
     held: Sequence[str] = (),
 ) -> Iterator[ExtendedFit | None]:
-    """Refit several machines side by side; None for each that fails or costs more than cost_limit after a few passes.
+    """Refit several machines side by side; None for each that fails or moves on above cost_limit.
 
     held: for each machine a parameter that stays at its file's value.
     """

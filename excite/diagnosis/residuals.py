@@ -138,7 +138,7 @@ def _process_forces(stage: ExtendedFit, s: np.ndarray, u: np.ndarray) -> list[tu
     space, X, model = stage.data.space, stage.fit.X, stage.model
     steps = integrate(space, s, u[:-1], u[1:], X)
     defect = (s[1:] - steps.end) / state_scale(space)
-    F = differentiate(space, steps, X, force=True).F / state_scale(space)[:, None]
+    F = np.nan_to_num(differentiate(space, steps, X, force=True).F) / state_scale(space)[:, None]
     square = F.transpose(0, 2, 1) @ F
     square += 1e-12 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(F.shape[2])
     force = np.linalg.solve(square, F.transpose(0, 2, 1) @ np.nan_to_num(defect)[:, :, None])[:, :, 0]

@@ -36,8 +36,8 @@ def estimate_in_full(
     """Estimate with the tolerances of the machine file in the intervals, and test what is left.
 
     exact: the estimate if the model alone explains the logs, for a method that knows any effect: where it raises
-    UnexplainedError, tolerances are tried as further parameters of it, and find comes last. find: the method, if exact
-    is None. Raises NoEstimateError, as the method does.
+    NoEstimateError, tolerances are tried as further parameters of it. find: the method, if exact is None or if no exact
+    fit explains the logs. Raises NoEstimateError, as the method does.
     """
     small = bool(model.slips) or (exact is not None and len(model.coordinates) <= MOST_JOINTS)
     every = [x for x in tolerances(model.machine) if small or x.effect in CHANNEL_EFFECTS]
@@ -73,18 +73,20 @@ def estimate_in_full(
     try:
         if small:
             near = estimate.smoothed or [None] * len(logs)
-            white = [white_residuals(full, log, X, filter, courses, one) for log, one in zip(logs, near, strict=True)]
+            at = replace(full, nominal=X)
+            white = [white_residuals(at, log, filter, courses, one) for log, one in zip(logs, near, strict=True)]
         else:
             white = _beyond_torques(model, logs, filter, estimate, X[:n], every)
     except NotConvergedError:
         reason = "no motion of the machine with these parameters follows the log"
-        return replace(estimate, doubt=estimate.doubt or reason)
+        without = "the tolerances of the machine file are not in the intervals"
+        return replace(estimate, doubt=f"{estimate.doubt or reason}; {without}", smoothed=())
     if wide is not None:
         estimate = budget.consider(full, estimate, white, [x for x in every if x.considered])
     elif every:
         estimate, errors = budget.correct(full, estimate, white, every, explained)
     if not small:
-        estimate = budget.leave_out_noise(model, estimate, white)
+        estimate = budget.leave_out_noise(estimate, white)
     shown = zip(narrowed if wide is not None else every, errors.value, errors.std, strict=True)
     tolerated = [(x.source, v, s, _describe(x, v, s)) for x, v, s in shown]
     tolerated += [*_scaled(model, estimate, every), *_alignments(model, estimate)]
@@ -100,13 +102,14 @@ def _beyond_torques(
     """Whiten what a method without tolerances leaves; errors of torque channels stand behind the parameters."""
     drives, begin, white = {b.where: k for k, b in enumerate(model.machine.actuated)}, 0, []
     channels = [(drives[x.where], x.effect, x.std) for x in every]
+    at = replace(model, nominal=X)
     for log in logs:
         own = slice(begin, begin + len(log))
         begin = own.stop
         courses, innovations = torque_courses(model)[0], estimate.innovations
         if estimate.lacking is not None and len(model.coordinates) <= MOST_JOINTS:
             gains = [(drive, std) for drive, _, std in channels]
-            white.append(with_channels(model, log, X, filter, courses, gains, estimate.lacking[:, own]))
+            white.append(with_channels(at, log, filter, courses, gains, estimate.lacking[:, own]))
             continue
         innovations = None if innovations is None else innovations[:, own]
         white.append(row_residuals(model, log, X, filter, courses, channels, innovations))

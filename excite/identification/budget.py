@@ -110,7 +110,7 @@ def correct(
     return replace(estimate, value=corrected, tolerated=_by_source(every, shifts)), errors
 
 
-def leave_out_noise(model: Model, estimate: Estimate, white: Sequence[WhiteResiduals]) -> Estimate:
+def leave_out_noise(estimate: Estimate, white: Sequence[WhiteResiduals]) -> Estimate:
     """Call parameters unidentifiable whose signature is mostly noise: least squares makes them too small, or zero.
 
     A plateau of constant speed shows no mass, however precisely noisy accelerations seem to tell it.

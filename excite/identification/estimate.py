@@ -42,9 +42,10 @@ class FitTest:
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """A force that the model lacks: rms along the logs [unit] in a torque signal, as a function of what (kind).
+    """A force that the model lacks: rms along the logs [unit: N m, N, m/s2 or rad].
 
-    kind: "with speed", "with position", "slow" or "fast". scale: of the variable that it changes with [SI].
+    signal: torque channel, or place on the machine. kind: what it follows, in words, such as "with speed" or "slow".
+    scale: of the variable that it changes with [SI].
     """
 
     signal: str

@@ -235,7 +235,6 @@ def _course_tests(
     score = G[own, data] - G[own, p] @ solved[:, : 1 + B]
     information = G[own, own] - G[own, p] @ solved[:, 1 + B :]
     size = np.sqrt(np.maximum(np.diag(G)[own], 1e-300))
-    units = "A" if model.machine.in_ratios else "N m"
     error = np.concatenate([one.torque_error for one in white])
     found = []
     for drive, name in enumerate(model.inputs):
@@ -252,7 +251,7 @@ def _course_tests(
             rms = float(np.sqrt(np.mean((error[:, at] @ amount) ** 2)))
             of = float(np.sqrt(np.mean([one.misfit[drive] ** 2 for one in white])))
             straight = not model.coordinates[model.actuated[drive]].startswith("theta")
-            unit_text = "N" if straight and units == "N m" else units
+            unit_text = model.machine.torque_unit or ("N" if straight else "N m")
             text = (
                 f"{name}: residuals follow the {family}, {format_number(rms, 2)} {unit_text}"
                 f" of {format_number(max(of, rms), 2)}"

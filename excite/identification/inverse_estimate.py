@@ -44,7 +44,7 @@ def inverse(model: Model, logs: Sequence[Log], filter: Filter, settings: Inverse
         raise MachineError(
             f"{model.machine.name}: method inverse needs a drive on every joint and no contact: use joint"
         )
-    _require_motion(model, logs)
+    _require_finite(model, logs)
     beside = [_beside(model, log, filter) for log in logs]
     fit = fit_inverse(model, logs, settings, beside)
     if fit.held.all() or not np.isfinite(fit.covariance).all():
@@ -52,8 +52,8 @@ def inverse(model: Model, logs: Sequence[Log], filter: Filter, settings: Inverse
     return _build_estimate(model, logs, filter, fit, beside)
 
 
-def _require_motion(model: Model, logs: Sequence[Log]) -> None:
-    """Raise NotIdentifiableError if a log is not finite or lacks a sensor of a joint."""
+def _require_finite(model: Model, logs: Sequence[Log]) -> None:
+    """Raise NotIdentifiableError if a sensor's column is not finite."""
     for log in logs:
         for sensor in model.machine.sensors("full"):
             if sensor.name in log.values and not np.isfinite(log.values[sensor.name]).all():

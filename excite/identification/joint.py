@@ -92,7 +92,7 @@ def joint_exactly(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate
     if (not close or shows_sticking(model, logs, filter, fit)) and (stuck := _fit_sticking(model, logs, filter, held)):
         return stuck
     if not close or lacks_forces(space, measurements, starts, held, fit):
-        raise UnexplainedError("the model alone does not explain the log", fit if fit.linear else None)
+        raise UnexplainedError("the model alone does not explain the log")
     fit, one_sided, flat_notes = quantify_uncertainty(space, measurements, starts, fit)
     notes = (*describe_noise(space, measurements), *flat_notes)
     return _build_estimate(space, measurements, fit, filter, notes, one_sided)
@@ -101,7 +101,8 @@ def joint_exactly(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate
 def joint_beside_forces(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     """Estimate beside forces that the model lacks (`excite.smoothing.fit_unknown_forces`); a note tells their size.
 
-    If no such forces are found, the model has process noise. The estimate is doubtful. Raises NotConvergedError.
+    If that fit does not settle, process noise is tried; if no level converges, the fit that did not settle is returned,
+    its next step in the doubt. The estimate is doubtful. Raises NotConvergedError.
     """
     space, measurements, starts, held = _prepare(model, logs, filter)
     notes = describe_noise(space, measurements)
@@ -114,9 +115,10 @@ def joint_beside_forces(model: Model, logs: Sequence[Log], filter: Filter) -> Es
                 return replace(_build_estimate(space, weighted, noisy, filter, notes), doubt=UNEXPLAINED_DOUBT)
     found = around.fit if around.fit.linear else around.fit.required()
     missing = describe_missing(space, found.unknown, found.trajectories)
-    told = [f"{m.name} {format_number(m.rms, 2)} {m.unit}" for m in missing]
-    note = f"what the model does not explain, rms along the logs: {'; '.join(told)}"
-    estimate = _build_estimate(space, around.measurements, found, filter, (*notes, note))
+    if missing:
+        parts = [f"{m.name.replace('_', ' ')} {format_number(m.rms, 2)} {m.unit}" for m in missing]
+        notes = (*notes, f"what the model does not explain, rms along the logs: {'; '.join(parts)}")
+    estimate = _build_estimate(space, around.measurements, found, filter, notes)
     moving = "" if found.step <= ACCEPTABLE_STEP else f"; {STALLED_DOUBT.format(format_number(found.step, 2))}"
     return replace(estimate, doubt=UNEXPLAINED_DOUBT + moving, discrepancy=_discrepancy(missing))
 
@@ -193,14 +195,14 @@ def _build_estimate(
         q, nu, z, u, a = smoothed_motion(space, data, trajectory, fit.X)
         outside.append(outside_law(model, q, nu, fit.X))
         effect_inputs = () if model.plain else (u.T, z.T)
-        plain_with_noise = fit.process_noise > 0 and model.plain
-        if plain_with_noise:  # accelerations by process noise are not the model's
+        beside_forces = (fit.process_noise > 0 or fit.unknown.count > 0) and model.plain
+        if beside_forces:  # the model alone does not make these accelerations
             a = derivative(nu.T, float(model.machine.sampling_hz)).T
         rows = model.stacked_regressor(q.T, nu.T, a.T, *effect_inputs)
         W.append(rows.reshape(-1, len(fit.X)))
         measured, error = np.zeros((2, len(model.rows), len(u)))
         measured[list(model.actuated)], error[list(model.actuated)] = data.torque.T, -trajectory.sampled_torque_error.T
-        if plain_with_noise:
+        if beside_forces:
             error = measured - model.predict(q.T, nu.T, a.T, model.expand @ fit.X).full()
         Y.append(decimate(measured, filter.decimation))
         errors.append(decimate(error, filter.decimation))

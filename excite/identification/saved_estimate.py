@@ -106,7 +106,13 @@ def _estimate(summary: dict[str, Any], covariance: pd.DataFrame) -> Estimate:
         tuple(summary["notes"]),
         doubt=str(summary["doubt"]),
         discrepancy=tuple(
-            Discrepancy(signal, str(d["kind"]), float(d["rms"]), str(own["unit"]), float(d["scale"]))
+            Discrepancy(
+                signal.removesuffix(f" [{own['unit']}]"),
+                str(d["kind"]),
+                float(d["rms"]),
+                str(own["unit"]),
+                float(d["scale"]),
+            )
             for signal, own in summary.get("discrepancy", {}).items()
             for d in own["parts"]
         ),

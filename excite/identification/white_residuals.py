@@ -75,19 +75,18 @@ class WhiteResiduals:
 def white_residuals(
     model: Model,
     log: Log,
-    X: np.ndarray,
     filter: Filter,
     courses: Courses,
     near: tuple[StateSpace, Trajectory] | None = None,
 ) -> WhiteResiduals:
-    """Smooth a log with all parameters held at X (n_base,), and whiten residuals and signatures.
+    """Smooth a log with all parameters held at the nominal values, and whiten residuals and signatures.
 
     courses: function of the motion q, nu, a (N, n_q) and the low-passed torques u (N, n_u) that returns torque errors
     (N, n_u, C) [N m] of each drive. near: a trajectory to start from, and its state space. Raises NotConvergedError if
     no motion of the machine follows the log.
     """
-    held = replace(model, nominal=X)
-    space = build_state_space(held, common_sensors(held, [log]))
+    X = model.nominal
+    space = build_state_space(model, common_sensors(model, [log]))
     data = prepare_measurements(space, log, unbiased=True)
     start = initial_trajectory(space, data, log, filter)
     begin = start if near is None else transfer_trajectory(space, data, near[1], near[0], X)
@@ -133,13 +132,12 @@ def white_residuals(
 def with_channels(
     model: Model,
     log: Log,
-    X: np.ndarray,
     filter: Filter,
     courses: Courses,
     gains: Sequence[tuple[int, float]],
     lacking: np.ndarray,
 ) -> WhiteResiduals:
-    """Whiten what is left of a log beyond the torques that a discrepancy explains.
+    """Whiten what is left of a log beyond the torques that a discrepancy explains, at the nominal values.
 
     gains: drive and standard deviation of the gains of torque channels that stand behind the parameters.
     lacking (n_u, N): torque read that the discrepancy explains. Raises NotConvergedError.
@@ -153,7 +151,7 @@ def with_channels(
             errors[:, drive, column] = -std * u[:, drive]
         return np.concatenate([courses(q, nu, a, u), errors], axis=2)
 
-    found = white_residuals(model, replace(log, values=values), X, filter, with_gains)
+    found = white_residuals(model, replace(log, values=values), filter, with_gains)
     own = slice(0, found.courses.shape[2] - len(gains))
     return replace(
         found,

@@ -12,8 +12,7 @@ much of a motion lies beyond the linear soil law.
 `inverse_dynamics`, `motion_along`), others torques.
 
 For robust design, `perturbed_machines` draws machines around the nominal one, and `track_motion` simulates how each
-follows a nominal motion. The integrator is the Rosenbrock method RODAS; its coefficients (`GAMMA`, `A_ROWS`, ...) and
-linear solves are public for the smoother's linearisation.
+follows a nominal motion. The integrator is the Rosenbrock method RODAS.
 """
 
 import lazy_loader

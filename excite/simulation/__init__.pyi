@@ -12,15 +12,6 @@ from .position_control import (
     motion_along as motion_along,
     play_back as play_back,
 )
-from .rosenbrock import (
-    A_ROWS as A_ROWS,
-    C_ROWS as C_ROWS,
-    GAMMA as GAMMA,
-    STAGE_TIMES as STAGE_TIMES,
-    TIME_DERIVATIVE_WEIGHTS as TIME_DERIVATIVE_WEIGHTS,
-    lu as lu,
-    lu_solve as lu_solve,
-)
 from .scenarios import perturbed_machines as perturbed_machines, track_motion as track_motion
 from .sensors import (
     KITS as KITS,

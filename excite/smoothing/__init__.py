@@ -8,6 +8,8 @@ numerical method; `excite.identification` and `excite.diagnosis` decide what to 
 - `fit_logs` finds the most likely parameters and trajectories by Levenberg-Marquardt and returns a `Fit` with a status.
   Each pass linearises every log (`LinearisedLog`) and smooths it with the parallel smoother.
 - `fit_unknown_forces` does so beside forces that the model lacks, whose sizes it finds by marginal likelihood.
+- `fit_inverse` fits machines whose joints are all driven: the motion is a smooth process, the torque
+  read is the model's along it.
 - `quantify_uncertainty` adds encoder errors and profile likelihood to a fit's covariance.
 - `innovation_statistics` says whether model and noise explain a log; `whiten` and `whiten_signatures` give the
   innovations with which other effects are tested.

@@ -27,11 +27,9 @@ from .log_fit import (
     Fit as Fit,
     NotConvergedError as NotConvergedError,
     apply_step as apply_step,
-    covariance_in_si as covariance_in_si,
     fit_logs as fit_logs,
     linearise_logs as linearise_logs,
     newton_step as newton_step,
-    parameter_indices as parameter_indices,
     prior_information as prior_information,
     prior_terms as prior_terms,
 )
@@ -49,7 +47,6 @@ from .measurements import (
     smoothed_motion as smoothed_motion,
     torque_sensor as torque_sensor,
     transfer_trajectory as transfer_trajectory,
-    with_mean_edge_rates as with_mean_edge_rates,
 )
 from .sizes import FitBeside as FitBeside, fit_unknown_forces as fit_unknown_forces, lacks_forces as lacks_forces
 from .solver import Settings as Settings

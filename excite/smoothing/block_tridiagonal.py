@@ -154,8 +154,3 @@ def assemble_columns(w: Windows, local: np.ndarray, first: int, into: np.ndarray
     split = local.reshape(n, w.reach, w.width, c)
     for i in range(w.reach):
         into[first + i : first + i + n] += split[:, i]
-
-
-def of_windows(w: Windows, x: np.ndarray) -> np.ndarray:
-    """Return the unknowns (count, reach width, ...) of each window from all of them (blocks per_block, width, ...)."""
-    return np.concatenate([x[i : i + w.count] for i in range(w.reach)], axis=1)

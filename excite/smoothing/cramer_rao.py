@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from excite.errors import SimulationError
 from excite.model import Model
 from excite.model.machine import Machine, Sensor, noise_of
 from excite.simulation import Motion, measured_torques
@@ -71,7 +72,8 @@ def cramer_rao(
     data = with_mean_edge_rates(space, data, trajectory, motion.u, X)
     data = replace(data, used=data.used * _shares_read(space, state, noise, X))
     along = forward.evaluate(space, data, trajectory, state[0], X, no_unknown_forces(space, 1).lacking[0], exact=True)
-    assert along is not None
+    if along is None:
+        raise SimulationError("the motion cannot be integrated from sample to sample: it leaves the model's range")
     linear = forward.linearise(space, along, state[0], X)
     information = linear.Z[1:, 1:].copy()
     information[: len(X), : len(X)] += model.known.information(model.scale)

@@ -28,9 +28,12 @@ PART_SIZE = 200  # samples whose chain stays in the processor's cache; measured
 class Evaluation:
     """A log at a trajectory: what its sensors and its dynamics miss there.
 
-    steps: motion from each sample to the next. defect (N - 1, n): where it ends, minus the next state. residual (N, m),
-    weight (N, m): of the readings. noise (N - 1, n_e): standard deviation of the white errors, of torques and forces;
-    error (N - 1, n_e): the errors. start (n,): first state, from its prior mean.
+    steps: motion from each sample to the next. behind (N - 1, n_u, n_base): derivatives of the delivered torques by the
+    parameters. defect (N - 1, n): where the steps end, minus the next state. residual (N, m), weight (N, m): of the
+    readings; their derivatives H by the state, D by their offsets, reading_slopes by `StateSpace.reading_parameters`.
+    beat_inflation (N, m): of readings that beat with the clock. noise (N - 1, n_e): standard deviation of the white
+    errors, of torques and forces; error (N - 1, n_e): the errors. start (n,): first state, from its prior mean, over
+    its standard deviation. features (N, n_features): `StateSpace.features` along the states.
     """
 
     data: Measurements
@@ -116,7 +119,10 @@ def evaluate(
 
 
 def transitions(space: StateSpace, at: Evaluation, X: np.ndarray) -> TransitionJacobians:
-    """Return the derivatives of all transitions along an evaluated log, at parameters X (n_base,)."""
+    """Return the derivatives of all transitions along an evaluated log, at parameters X (n_base,).
+
+    A and B contain what is lacking where it follows the state; X, F and rising do not.
+    """
     found = differentiate(space, at.steps, X, False, bool(at.lacking.count))
     A, inverse = close(space, found, feedback_of(space, at))
     return found if inverse is None else replace(found, A=inverse @ A, B=inverse @ found.B)
@@ -226,8 +232,8 @@ def linearise(
         b[:, :, 0] = at.defect[begin:end] / scale - (gain @ relative_error[:, :, None])[:, :, 0]
         b[:, :, 1 : 1 + n_p] = (by.X + by.B[:, :, :n_u] @ at.behind[begin:end]) * (space.model.scale / scale[:, None])
         for own, j, values in terms:
-            first, last = values[begin:end, None, :], values[begin + 1 : end + 1, None, :]
-            change = by.B[:, :, j, None] * first + by.rising[:, :, j, None] * (last - first)
+            at_start, at_end = values[begin:end, None, :], values[begin + 1 : end + 1, None, :]
+            change = by.B[:, :, j, None] * at_start + by.rising[:, :, j, None] * (at_end - at_start)
             b[:, :, 1 + n_p + own] += change / scale[:, None]
         if drawn is not None:
             b[:, :, -1] = (gain @ drawn[begin:end, acting, None])[:, :, 0]
@@ -359,12 +365,14 @@ def interpolate(a: Trajectory, b: Trajectory, fraction: float) -> Trajectory:
     def mix(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return x + fraction * (y - x)
 
-    none = np.zeros(1) if b.force_error is None else np.zeros_like(b.force_error)
+    force = b.force_error
+    if force is not None:
+        force = mix(np.zeros_like(force) if a.force_error is None else a.force_error, force)
     return Trajectory(
         mix(a.state, b.state),
         mix(a.torque_error, b.torque_error),
         mix(a.offset, b.offset),
         mix(a.ground_inputs, b.ground_inputs),
         mix(a.lacking, b.lacking),
-        None if b.force_error is None else mix(none if a.force_error is None else a.force_error, b.force_error),
+        force,
     )

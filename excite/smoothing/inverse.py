@@ -120,12 +120,10 @@ def torque_parts(
     coefficients = point.coefficients[n]
     motion = chain.motion(coefficients)
     found = chain.torque - problem.torque.prediction(chain, motion, point.X)
-    return found - extra_torque(problem, chain, design, basis, point, n)
+    return found - extra_torque(chain, design, basis, point)
 
 
-def extra_torque(
-    problem: Problem, chain: Chain, design: Design, basis: Basis | None, point: Point, n: int
-) -> np.ndarray:
+def extra_torque(chain: Chain, design: Design, basis: Basis | None, point: Point) -> np.ndarray:
     """Return the torque (N, n) beside the model's: alignment and discrepancy."""
     found = design.delay * (point.shift - chain.moved * float(chain.t[1] - chain.t[0]))
     if basis is not None:
@@ -294,7 +292,7 @@ def slot_terms(
     channels, width = problem.channels, point.coefficients[n].shape[1]
     motion = part.motion(point.coefficients[n])
     y, by_state, W = problem.torque.linear(motion.reshape(len(motion), -1), *part.beside, point.X)
-    residual = part.torque - y[:, :, 0] - extra_torque(problem, part, design, basis, point, n)
+    residual = part.torque - y[:, :, 0] - extra_torque(part, design, basis, point)
     by_state = by_state.reshape(len(motion), channels, 3, channels)
     by_motion = np.zeros((len(motion), channels, ORDER, width))
     by_motion[..., :channels] = np.einsum("rdi,rjdm->rjim", part.basis, by_state, optimize=True)

@@ -78,7 +78,6 @@ class InverseFit:
     shift: np.ndarray
     shift_std: np.ndarray
     last_step: float
-    step_s: float
 
 
 @dataclass(frozen=True)
@@ -488,7 +487,7 @@ def conclude(
     motions = tuple(c.motion(x) for c, x in zip(problem.chains, point.coefficients, strict=True))
     residual, extra = [], []
     for m, (chain, design) in enumerate(zip(problem.chains, state.designs, strict=True)):
-        extra.append(extra_torque(problem, chain, design, state.basis, point, m))
+        extra.append(extra_torque(chain, design, state.basis, point))
         residual.append(torque_parts(problem, chain, design, state.basis, point, m))
     components = []
     if state.basis is not None:
@@ -516,5 +515,4 @@ def conclude(
         point.shift,
         np.sqrt(np.diag(covariance)[p:]) * problem.shift_std,
         step,
-        problem.chains[0].knots.step,
     )

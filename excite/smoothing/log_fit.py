@@ -37,16 +37,7 @@ SETTLING_PASSES = 3  # until the states fit the dynamics well enough to judge wh
 
 
 class NotConvergedError(NoEstimateError):
-    """Joint smoothing found no estimate; fit: where it ended, None if it never began."""
-
-    def __init__(self, message: str, fit: Fit | None = None) -> None:
-        super().__init__(message)
-        self.fit = fit
-
-    @property
-    def acceptable_fit(self) -> Fit | None:
-        """The fit, if its next step is small enough to accept it."""
-        return self.fit if self.fit is not None and self.fit.step <= ACCEPTABLE_STEP else None
+    """Joint smoothing found no estimate."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +46,10 @@ class Fit:
 
     X (n_base,) [SI], covariance (n_base, n_base) [SI]. unidentifiable (n_base,): parameters held at the machine file's
     values. prior (n_base,): information about these values, scaled. cost: twice the negative log-likelihood.
-    process_noise: level, in units of `forward.PROCESS_NOISE_UNIT`. status, step [standard deviations], history: see
-    `solver.Solution`. unknown: what the model lacks. information: of all unknowns, scaled.
+    trajectories, linear: of each log. process_noise: level, in units of `forward.PROCESS_NOISE_UNIT`. status, step
+    [standard deviations], history: see `solver.Solution`. unknown: what the model lacks. information: of all unknowns,
+    scaled; right_side: information times the most likely values, where parameters count from X and coefficients from
+    zero. determinant: of a probed fit.
     """
 
     X: np.ndarray
@@ -86,8 +79,7 @@ class Fit:
         raise NotConvergedError(
             f"joint smoothing found no estimate: {self.status} after {len(self.history)} steps (last step"
             f" {format_number(self.step, 3)} standard deviations): check the log with `excite log check` and `excite"
-            " diagnose`, or start from better values in the machine file",
-            self if self.linear else None,
+            " diagnose`, or start from better values in the machine file"
         )
 
 
@@ -235,7 +227,7 @@ class LogProblem:
         """Linearise every log and integrate out its states; return None if a chain is singular."""
         X = self.point.X
         try:
-            self.linear = tuple(
+            linear = tuple(
                 forward.linearise(
                     self.space,
                     e,
@@ -248,16 +240,16 @@ class LogProblem:
             )
         except np.linalg.LinAlgError:  # the chain is numerically singular this far off
             return None
-        self.linearised_coefficients = self.unknown.coefficients(self.point.trajectories)
         information, slope, cost = self.beside_logs()
-        for log, own in zip(self.linear, self.indices, strict=True):
+        for log, own in zip(linear, self.indices, strict=True):
             k = slice(1, 1 + len(own))
             information[np.ix_(own, own)] += log.Z[k, k]
             slope[own] += log.Z[k, 0]
             cost += float(log.Z[0, 0])
-        lost = any(log.Z[0, 0] < 0 for log in self.linear)  # a sum of squares: rounding has taken over
+        lost = any(log.Z[0, 0] < 0 for log in linear)  # a sum of squares: rounding has taken over
         if lost or not (np.isfinite(information).all() and (np.diag(information) > 0).all()):
             return None
+        self.linear, self.linearised_coefficients = linear, self.unknown.coefficients(self.point.trajectories)
         n_p = len(self.prior)
         parameter = np.arange(len(slope)) < n_p
         free = parameter.copy()
@@ -396,24 +388,29 @@ def fit_with_unknown_forces(
     def solve(fixed: np.ndarray, at: Point, how: Settings) -> tuple[LogProblem, Solution[Point]]:
         at = Point(np.where(fixed, space.model.nominal, at.X), at.trajectories)
         prior = prior_information(space.model, fixed, at.X)
-        problem = LogProblem(space, measurements, starts, prior, fixed, process_noise, unknown, probed, pull)
+        own = None if pull is None else replace(pull, slope=np.where(fixed, 0.0, pull.slope))
+        problem = LogProblem(space, measurements, starts, prior, fixed, process_noise, unknown, probed, own)
         return problem, solver.minimise(problem, at, how)
 
-    fixed, done, history = held, 0, tuple[tuple[float, float], ...]()
+    fixed, history = held, tuple[tuple[float, float], ...]()
+    done, stage = 0, 0
     while True:
         passes = min(SETTLING_PASSES if not done else 2 * done, settings.passes - done)
         damping = settings.damping * settings.decrease**done
         how = replace(settings, passes=passes, damping=damping, settled=0 if done else settings.settled)
-        problem, solution = solve(fixed, point, how)
-        point, history, done = solution.point, history + solution.history, done + passes
+        later = solve(fixed, point, how)
+        if later[1].quadratic is None and stage > 0:  # what is held now leads out of the range of motions
+            break
+        (problem, solution), judged = later, fixed
+        point, history, done, stage = solution.point, history + solution.history, done + passes, stage + 1
         if solution.quadratic is None or done == settings.passes:
             break
-        unidentifiable = find_unidentifiable(problem, solution.quadratic)
+        # What was held while the fit was far off is judged once more; then parameters are only added.
+        fixed = find_unidentifiable(problem, solution.quadratic, held if stage == 2 else judged)
         finished = solution.status != "stalled" or not solution.history
-        if finished and (unidentifiable == fixed).all():
+        if finished and (fixed == judged).all():
             break
-        fixed = unidentifiable
-    return _as_fit(problem, solution, fixed, history)
+    return _as_fit(problem, solution, judged, history)
 
 
 def linearise_with(
@@ -467,16 +464,20 @@ def _as_fit(
     )
 
 
-def find_unidentifiable(problem: LogProblem, quadratic: Quadratic) -> np.ndarray:
+def find_unidentifiable(problem: LogProblem, quadratic: Quadratic, held: np.ndarray) -> np.ndarray:
     """Find the parameters (n_base,) to hold, besides `held`, so that no other's standard deviation exceeds its size.
+
+    Those that the problem holds beyond `held` are judged by what the logs tell of them.
 
     The one that exceeds its size most is held first, then the next given that: of parameters that the logs show only
     together, such as dry friction and offset in one direction, one is held. The size is that of the estimate or the
     scale, whichever is larger, as the machine file's value may be far too small.
     """
-    X, held = problem.point.X, problem.held
-    size = np.maximum(np.abs(X) / problem.space.model.scale, 1.0)
-    left = solver.inverse(quadratic.information)[: len(X), : len(X)]
+    X, information, model = problem.point.X, quadratic.information.copy(), problem.space.model
+    judged = np.flatnonzero(problem.held & ~held)
+    information[judged, judged] += (prior_information(model, held, X) - problem.prior)[judged]
+    size = np.maximum(np.abs(X) / model.scale, 1.0)
+    left = solver.inverse(information)[: len(X), : len(X)]
     found = held.copy()
     while True:
         excess = np.where(found, 0.0, np.sqrt(np.maximum(np.diag(left), 0.0)) / size)

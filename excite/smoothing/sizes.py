@@ -41,7 +41,7 @@ ROUNDS = (
 
 @dataclass(frozen=True)
 class FitBeside:
-    """A fit with unknown forces, and the measurements with the noise of torques that it found."""
+    """A fit with unknown forces, and the measurements with the noise of torques that it leaves."""
 
     fit: Fit
     measurements: tuple[Measurements, ...]
@@ -193,7 +193,7 @@ def _integrate_out_parameters(fit: Fit) -> _Coefficients:
 def white_noise_ratios(fit: Fit) -> np.ndarray:
     """Return the mean square of each white error, torques then forces with a size, over what a right model leaves.
 
-    The fit must be probed: what a draw of all noise leaves is the expectation. The square root corrects the noise.
+    The fit must be probed: what a draw of all noise leaves is the expectation.
     """
     slope, n_c = np.zeros(len(fit.right_side)), fit.unknown.count
     n = len(fit.X)

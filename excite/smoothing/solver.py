@@ -8,6 +8,7 @@ constrained variables, such as the states of logs, and leaves a quadratic form i
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Generic, Literal, Protocol, TypeVar
 
@@ -24,7 +25,8 @@ class Settings:
     """Settings of the solver.
 
     passes: largest number of linearisations. damping: information added to every parameter in the first pass
-    (Levenberg), in its scale; it falls by `decrease` with each full step and grows by its inverse after a refused one.
+    (Levenberg), in its scale; it falls by `decrease` with each full step. After a refused step it grows by INCREASE,
+    from this value at least; after a much shortened one by the root of that, from 1 at least.
     tolerance: largest step of a parameter that ends the iteration [standard deviations]. halvings: shortenings of a
     step before more damping is tried. sufficient_decrease: share of the predicted decrease that a step must reach.
     cost_limit: cost above which the iteration is stopped once `settled` steps are made and the next exceeds one
@@ -93,7 +95,8 @@ class Solution(Generic[Point]):
     "converged": the next step is below the tolerance. "stalled": no step lowers the merit by much, or passes ran out.
     "stopped": the cost exceeded its limit, or hardly falls with no minimum near. "out of range": the start has no cost.
     quadratic: about the last linearised point, None if there is none. cost: predicted after the last undamped step.
-    step: that step [standard deviations]. history: merit before and after each accepted step, with the same weights.
+    step: that step [standard deviations], infinite if the last point cannot be linearised. history: merit before and
+    after each accepted step, with the same weights.
     """
 
     point: Point
@@ -109,15 +112,16 @@ def minimise(problem: Problem[Point], start: Point, settings: Settings) -> Solut
     history = list[tuple[float, float]]()
     point, damping = start, settings.damping
     found: Quadratic | None = None
-    cost, length, status = np.inf, np.inf, "stalled"
+    cost, length = np.inf, np.inf
+    status: Status = "stalled"
     if not problem.enter(start):
         return Solution(start, "out of range", None, np.inf, np.inf, ())
-    done, slow = 0, 0
-    while done < settings.passes:
-        latest = problem.quadratic()
+    slow, refused = 0, False
+    for _ in range(settings.passes):
+        latest = found if refused else problem.quadratic()
         if latest is None:
+            length = np.inf
             break
-        done += 1
         found = latest
         deviation = np.sqrt(np.diag(inverse(found.information)))
         undamped = found.step(0.0)
@@ -141,8 +145,9 @@ def minimise(problem: Problem[Point], start: Point, settings: Settings) -> Solut
             if length < STALLED_STEP or damping > MAX_DAMPING:
                 status = "converged" if length < STALLED_STEP else "stalled"
                 break
-            damping = max(damping, settings.damping) / settings.decrease
+            damping, refused = max(damping, settings.damping, 1.0) * INCREASE, True
             continue
+        refused = False
         history.append((before, merit))
         point = path(fraction)
         slow = slow + 1 if fraction < 1.0 and before - merit < SLOW_DECREASE * before else 0
@@ -155,10 +160,11 @@ def minimise(problem: Problem[Point], start: Point, settings: Settings) -> Solut
                 status = "converged"
                 break
         elif fraction < 0.3:
-            damping = max(damping, 1.0) / np.sqrt(settings.decrease)
-    return Solution(point, status, found, cost, length, tuple(history))  # type: ignore[arg-type]
+            damping = max(damping, 1.0) * np.sqrt(INCREASE)
+    return Solution(point, status, found, cost, length, tuple(history))
 
 
+INCREASE = 10.0  # of the damping after a refused step
 STALLED_STEP = 0.1  # a step below this that no longer lowers the merit is lost in rounding [standard deviations]
 SLOW_STEPS = 3  # shortened steps in a row that hardly lower the merit, after which no minimum is near
 SLOW_DECREASE = 0.01  # relative, of a merit
@@ -186,7 +192,7 @@ def limited_step(information: np.ndarray, slope: np.ndarray, rows: np.ndarray, b
     """Minimise a quadratic cost with information (n, n) and slope (n,) over steps p (n,) with rows @ p >= bounds.
 
     rows (m, n), bounds (m,), none above zero. Source: Lawson and Hanson, "Solving Least Squares Problems", 23.4 (least
-    distance programming by non-negative least squares).
+    distance programming by non-negative least squares). Where that fails by rounding, the free step is shortened.
     """
     root, size = _scaled_root(information)
     target = -scipy.linalg.solve_triangular(root, slope / size, lower=True)
@@ -196,9 +202,15 @@ def limited_step(information: np.ndarray, slope: np.ndarray, rows: np.ndarray, b
     G = scipy.linalg.solve_triangular(root, (rows / size).T, lower=True).T
     length = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
     G, missing = G / length[:, None], (bounds - rows @ free) / length
-    weights, _ = scipy.optimize.nnls(np.vstack([G.T, missing]), np.append(np.zeros(len(target)), 1.0))
-    left = np.append(G.T @ weights, missing @ weights - 1.0)
-    return np.asarray(free + scipy.linalg.solve_triangular(root.T, -left[:-1] / left[-1]) / size)
+    with suppress(RuntimeError):  # too many iterations
+        weights, _ = scipy.optimize.nnls(np.vstack([G.T, missing]), np.append(np.zeros(len(target)), 1.0))
+        left = np.append(G.T @ weights, missing @ weights - 1.0)
+        if left[-1] < 0:
+            found = free + scipy.linalg.solve_triangular(root.T, -left[:-1] / left[-1]) / size
+            if np.isfinite(found).all():
+                return np.asarray(found)
+    beyond = rows @ free < bounds
+    return np.asarray(free * (bounds[beyond] / (rows[beyond] @ free)).min())
 
 
 def inverse(information: np.ndarray) -> np.ndarray:

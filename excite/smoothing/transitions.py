@@ -137,12 +137,14 @@ class _Integration:
         time = at + share * STAGE_TIMES
         inputs = self.left[interval][:, None] + time[:, None] * self.rise[interval][:, None]
         first = self.left[interval] + at * self.rise[interval]
-        stages, accurate = self._step(y, guess, first, inputs, share * self.sample)
+        stages, solved, accurate = self._step(y, guess, first, inputs, share * self.sample)
         end = stages[:, 2].copy()
         if splits:
-            bad, good = np.flatnonzero(~accurate), np.flatnonzero(accurate)
+            bad = np.flatnonzero(~accurate & np.isfinite(y).all(axis=1))
+            good = np.flatnonzero(accurate)
         else:
             bad, good = np.empty(0, int), np.arange(len(y))
+            end[~solved] = np.nan
         if len(good):
             self.steps.append(
                 (interval[good], np.full(len(good), at), np.full(len(good), share), stages[good], inputs[good])
@@ -155,8 +157,11 @@ class _Integration:
 
     def _step(
         self, y: np.ndarray, guess: np.ndarray | None, first: np.ndarray, inputs: np.ndarray, h: float
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Make one step over h [s] from states y (K, n); return its stages (K, 3, n) and where they are accurate."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Make one step over h [s] from states y (K, n).
+
+        Returns its stages (K, 3, n), where their equations are solved (K,), and where the step is accurate (K,).
+        """
         space, c, K = self.space, self.space.core, len(y)
         rise = np.zeros((K, 3, space.n)) if guess is None else STAGE_TIMES[:, None] * (guess - y)[:, None]
         J = space.slopes(y + rise[:, 1], inputs[:, 1], self.X)[0]
@@ -166,7 +171,7 @@ class _Integration:
         real = np.linalg.inv(_VALUES[_REAL].real / h * eye - J)
         both = np.linalg.inv(_VALUES[_COMPLEX] / h * eye - J)
         left, size = np.arange(K), self.scale
-        converged = np.zeros(K, bool)
+        last = np.full(K, np.inf)
         rates = np.zeros((K, 3, space.n))
         for _ in range(NEWTON_STEPS):
             stage = y[left, None] + rise[left]
@@ -179,7 +184,7 @@ class _Integration:
             step += 2 * (_VECTORS[:, _COMPLEX][:, None] * (both[left] @ pair[:, :, None])[:, None, :, 0]).real
             rise[left, :, :c] += step
             length = np.abs(step / size[:c]).max(axis=(1, 2))
-            converged[left] = length < NEWTON_TOLERANCE
+            last[left] = length
             left = left[(length >= NEWTON_TOLERANCE) & np.isfinite(length)]
             if len(left) == 0:
                 break
@@ -188,9 +193,11 @@ class _Integration:
         error = real @ (start + (_ERROR_WEIGHTS @ rise[:, :, :c]) / h)[:, :, None]
         # A second time, so that what is off and dies out within the step does not count (8.20).
         error = (_VALUES[_REAL].real / h * (real @ error))[:, :, 0]
-        accurate = converged & finite & (np.abs(error / size[:c]).max(axis=1, initial=0.0) < STEP_TOLERANCE)
+        solved = finite & (last < STEP_TOLERANCE)
+        accurate = solved & (last < NEWTON_TOLERANCE)
+        accurate &= np.abs(error / size[:c]).max(axis=1, initial=0.0) < STEP_TOLERANCE
         rise[~finite] = np.nan
-        return y[:, None] + rise, accurate
+        return y[:, None] + rise, solved, accurate
 
 
 def differentiate(
@@ -198,15 +205,19 @@ def differentiate(
 ) -> TransitionJacobians:
     """Compute the derivatives of K transitions at base parameters X (n_base,).
 
-    force, rising: fill F, and the derivatives by rising torques, as well.
+    force, rising: fill F, and the derivatives by rising torques, as well. Those of an interval that could not be
+    integrated are nan.
     """
     A, direct, sizes = _step_jacobians(space, steps, X, force, rising)
     for own, before in _following(steps.interval):
         direct[own] += A[own] @ direct[before]
         A[own] = A[own] @ A[before]
     last = np.searchsorted(steps.interval, np.arange(len(steps.end)), side="right") - 1
-    B, by_X, F, R = np.split(direct[last], np.cumsum(sizes)[:-1], axis=2)
-    return TransitionJacobians(A[last], B, by_X, F, R)
+    missing = ~np.isin(np.arange(len(steps.end)), steps.interval)
+    A, direct = A[last], direct[last]
+    A[missing], direct[missing] = np.nan, np.nan
+    B, by_X, F, R = np.split(direct, np.cumsum(sizes)[:-1], axis=2)
+    return TransitionJacobians(A, B, by_X, F, R)
 
 
 def _following(interval: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:

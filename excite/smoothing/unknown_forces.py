@@ -94,14 +94,15 @@ class Group:
     """Coefficients that share one size.
 
     name: input or sensor, and what it depends on. unit: of the coefficients. typical: usual size [unit] where a
-    machine lacks something. columns: of each log, the places of the coefficients in it; index: of each log, their
-    places among all coefficients.
+    machine lacks something. index: for each log, the places of the coefficients among those of all logs. period: of the
+    fastest course [s], 0 for what follows no time.
     """
 
     name: str
     unit: str
     typical: float
     index: tuple[np.ndarray, ...]
+    period: float = 0.0
 
     @property
     def every(self) -> np.ndarray:
@@ -111,7 +112,10 @@ class Group:
 
 @dataclass(frozen=True)
 class _Entry:
-    """One group in one log: name, unit, typical size, whether logs share its coefficients, terms as (at, shapes)."""
+    """One group in one log: name, unit, typical size, whether logs share its coefficients, terms as (at, shapes).
+
+    period: of the fastest course [s], 0 for what follows no time.
+    """
 
     name: str
     unit: str
@@ -120,6 +124,7 @@ class _Entry:
     inputs: tuple[tuple[int, np.ndarray | Form], ...]
     count: int
     reading: bool = False
+    period: float = 0.0
 
 
 SLOWEST_PERIOD_S = 8.0  # of a slow course [s]: longer than a manoeuvre
@@ -187,7 +192,7 @@ def catalogue(
                 index = np.arange(total, total + e.count)
                 total += e.count
             before = known.index if known is not None else ()
-            groups[e.name] = Group(e.name, e.unit, e.typical, (*before, index))
+            groups[e.name] = Group(e.name, e.unit, e.typical, (*before, index), e.period)
             for place, shapes in e.inputs:
                 form, course = (shapes, None) if callable(shapes) else (None, e.typical * shapes)
                 (readings if e.reading else inputs).append(Term(columns, place, e.typical, course, form))
@@ -227,6 +232,7 @@ def _entries(
     model = space.model
     machine, rate = model.machine, float(model.machine.sampling_hz)
     t = np.arange(len(trajectory.state)) / rate
+    duration = float(t[-1])
     slow = np.cos(np.pi * np.arange(1, max(2, int(2 * t[-1] / SLOWEST_PERIOD_S)) + 1) * (t[:, None] / t[-1]))
     q, nu, _ = space.unpack(trajectory.state)
     u = space.delivered_torques(data.torque, X)[0] + trajectory.sampled_torque_error
@@ -235,9 +241,9 @@ def _entries(
     found = list[_Entry]()
 
     def add(
-        name: str, unit: str, typical: float, shapes: np.ndarray | Form, at: int, count: int, shared: bool = True
+        name: str, unit: str, typical: float, shapes: np.ndarray | Form, at: int, count: int, period: float = 0.0
     ) -> None:
-        found.append(_Entry(name, unit, typical, shared, ((at, shapes),), count))
+        found.append(_Entry(name, unit, typical, period == 0, ((at, shapes),), count, False, period))
 
     mix = np.linalg.cholesky(FRICTION_CORRELATION ** np.abs(np.subtract.outer(*[np.arange(len(FRICTION_KNOTS))] * 2)))
     for k, body in enumerate(machine.actuated):
@@ -255,12 +261,12 @@ def _entries(
         usual = 0.02 * large if body.friction is None else max(0.02 * large, 0.3 * float(body.friction.Fs))
         add(f"{where}: torque with speed", unit, usual, curves, k, 2 * len(FRICTION_KNOTS))
         half = slow[:, : slow.shape[1] // 2]
-        add(f"{where}: torque, slow", unit, 0.005 * large, half, k, half.shape[1], False)
+        add(f"{where}: torque, slow", unit, 0.005 * large, half, k, half.shape[1], 2 * duration / half.shape[1])
         gentle = smooth_part(u[:, k])
         warming = np.column_stack(
             [f * c for f in (w / speeds[body.index], np.tanh(w / smoothing)) for c in slow[:, :SOIL_PERIODS].T]
         )
-        add(f"{where}: friction, slow", unit, 0.02 * large, warming, k, warming.shape[1], False)
+        add(f"{where}: friction, slow", unit, 0.02 * large, warming, k, warming.shape[1], 2 * duration / SOIL_PERIODS)
         rise = np.gradient(gentle) * rate
         add(f"{where}: torque late", "s", 0.01, -rise[:, None], k, 1)
         if body.contact is not None:
@@ -300,12 +306,13 @@ def _contact_entries(
     standard = dict(zip(model.base.standard, model.expand @ X, strict=True))
     Kx, Ky = abs(standard[f"Kx{k}"]), abs(standard[f"Ky{k}"])
     largest = float(np.hypot(slips["gx", k], slips["gy", k]))
-    found, knots = list[_Entry](), SOIL_KNOTS * largest
+    found, knots, duration = list[_Entry](), SOIL_KNOTS * largest, (len(slow) - 1) / rate
 
     def add(
-        name: str, unit: str, typical: float, shapes: np.ndarray | Form, kind: str, count: int, shared: bool = True
+        name: str, unit: str, typical: float, shapes: np.ndarray | Form, kind: str, count: int, period: float = 0.0
     ) -> None:
-        found.append(_Entry(f"{where}: {name}", unit, typical, shared, ((place[kind], shapes),), count))
+        every = ((place[kind], shapes),)
+        found.append(_Entry(f"{where}: {name}", unit, typical, period == 0, every, count, False, period))
 
     for kind, own, other, K in (("lengthwise", "gx", "gy", Kx), ("lateral", "gy", "gx", Ky)):
         if kind not in place:
@@ -313,10 +320,11 @@ def _contact_entries(
         g = features[:, feature[own]]
         curves = partial(soil_curves, along=feature[own], across=feature[other], stiffness=K, knots=knots)
         add(f"{kind} stiffness with slip", "-", 0.1, curves, kind, len(SOIL_KNOTS) - 1)
-        add(f"{kind} stiffness, slow", "-", 0.05, -K * g[:, None] * slow[:, :SOIL_PERIODS], kind, SOIL_PERIODS, False)
+        changing = -K * g[:, None] * slow[:, :SOIL_PERIODS]
+        add(f"{kind} stiffness, slow", "-", 0.05, changing, kind, SOIL_PERIODS, 2 * duration / SOIL_PERIODS)
         relaxing = K * np.gradient(smooth_part(g)) * rate / speed
         add(f"{kind} force late", "m", 0.02, relaxing[:, None], kind, 1)
-        add(f"{kind} force, slow", "N", 50.0, slow, kind, slow.shape[1], False)
+        add(f"{kind} force, slow", "N", 50.0, slow, kind, slow.shape[1], 2 * duration / slow.shape[1])
     if "turning" in place:
         moment = -Kx * float(body.contact.width) / 6
         curves = partial(
@@ -412,7 +420,7 @@ def no_unknown_forces(space: StateSpace, logs: int) -> UnknownForces:
 class Missing:
     """One thing that a model lacks: rms along the logs [unit], by its place and what it follows.
 
-    scale: period [s] of the fastest course, 0 for what follows no time.
+    rms: of white forces their standard deviation. scale: period [s] of the fastest course, 0 for what follows no time.
     """
 
     place: str
@@ -430,7 +438,7 @@ class Missing:
 def describe_missing(
     space: StateSpace, unknown: UnknownForces, trajectories: Sequence[Trajectory]
 ) -> tuple[Missing, ...]:
-    """Return what a fit lacks beyond LEAST_TOLD of the largest in its unit, largest first; white forces at the end."""
+    """Return what a fit lacks, beyond LEAST_TOLD of the largest in its unit, by unit and size; then white forces."""
     units = _input_units(space)
     square, samples = dict[tuple[str, str], float](), 0
     for trajectory, lacking, index in zip(trajectories, unknown.lacking, unknown.index, strict=True):
@@ -445,11 +453,10 @@ def describe_missing(
                     unit = units[term.at] if of_inputs else "rad"
                     course = term.values(features) @ trajectory.lacking[term.columns]
                     square[group.name, unit] = square.get((group.name, unit), 0.0) + float(course @ course)
-    found = list[Missing]()
+    found, periods = list[Missing](), {group.name: group.period for group in unknown.groups}
     for (name, unit), x in square.items():
         place, _, follows = name.partition(": ")
-        scale = SLOWEST_PERIOD_S if follows.endswith("slow") else 0.0
-        found.append(Missing(place, follows, float(np.sqrt(x / samples)), unit, scale))
+        found.append(Missing(place, follows, float(np.sqrt(x / samples)), unit, periods[name]))
     largest = {m.unit: max(x.rms for x in found if x.unit == m.unit) for m in found}
     found = sorted((m for m in found if m.rms > LEAST_TOLD * largest[m.unit]), key=lambda m: (m.unit, -m.rms))
     bodies = {b.index: b.where for b in space.model.machine.body}

@@ -222,10 +222,12 @@ def _fit_figure(model: Model, one: Log, compare: Callable[[], SignalComparison])
 
 
 def _discrepancy(estimate: Estimate) -> dict[str, Any]:
-    """Return by signal what the model lacks there and the intervals contain."""
+    """Return by signal, or place and unit if it has several, what the model lacks there and the intervals contain."""
     found: dict[str, Any] = {}
+    units = {d.signal: {x.unit for x in estimate.discrepancy if x.signal == d.signal} for d in estimate.discrepancy}
     for d in estimate.discrepancy:
-        own = found.setdefault(d.signal, {"rms": 0.0, "unit": d.unit, "parts": []})
+        name = d.signal if len(units[d.signal]) == 1 else f"{d.signal} [{d.unit}]"
+        own = found.setdefault(name, {"rms": 0.0, "unit": d.unit, "parts": []})
         own["rms"] = float(np.hypot(own["rms"], d.rms))
         own["parts"].append({"kind": d.kind, "rms": d.rms, "scale": d.scale})
     return found
