@@ -15,7 +15,7 @@ from excite.errors import NotIdentifiableError
 from excite.identification.estimate import Estimate
 from excite.identification.methods import identify
 from excite.logs import Log
-from excite.model import Model, nothing_known, required_signs
+from excite.model import Model, build, nothing_known, required_signs
 
 POSE_COUNT = 181  # poses at which the mass matrix is checked; chosen
 STEP_SHARES = np.linspace(1, 0, 21)  # of the way from the nominal values to the estimate; chosen
@@ -38,22 +38,29 @@ class PriorKnowledge:
 def prior_from_logs(model: Model, logs: Sequence[Log]) -> PriorKnowledge:
     """Build the prior from logs; unidentifiable parameters keep the machine file's value and get no information.
 
+    Effects that only sensors show are estimated beside, also where they are no parameters of the model.
+
     Raises NotIdentifiableError if the logs give no possible machine, and what `identify` raises.
     """
-    estimate = identify(model, logs, "joint")
+    estimate = identify(model if model.fit_sensor_effects else build(model.machine), logs, "joint")
     if estimate.status == "invalid":
         raise NotIdentifiableError(f"the logs give no estimate: {estimate.doubt}")
     return prior_from_estimate(model, estimate)
 
 
 def prior_from_estimate(model: Model, estimate: Estimate) -> PriorKnowledge:
-    """Build the prior from an estimate. Raises NotIdentifiableError if it gives no possible machine."""
-    identified = np.isfinite(estimate.value)
+    """Build the prior from an estimate of the model's parameters, among others.
+
+    Raises NotIdentifiableError if it gives no possible machine.
+    """
+    own = [estimate.names.index(n) for n in model.base.names]
+    value, covariance = estimate.value[own], estimate.covariance[np.ix_(own, own)]
+    identified = np.isfinite(value)
     information = np.zeros((len(identified), len(identified)))
     block = np.ix_(identified, identified)
     scales = np.outer(model.scale[identified], model.scale[identified])
-    information[block] = np.linalg.inv(estimate.covariance[block] / scales) / scales
-    X = estimate.value_or(model.nominal)
+    information[block] = np.linalg.inv(covariance[block] / scales) / scales
+    X = np.where(identified, value, model.nominal)
     for share in STEP_SHARES:
         nominal = model.nominal + float(share) * (X - model.nominal)
         if _is_possible(model, nominal):

@@ -220,8 +220,8 @@ class StateSpace:
     initial_std (n,): standard deviation of states whose start is known, NaN for the others.
     readings_use_torque: whether readings depend on the torque at the same sample.
     jacobians, readings, rates, slopes: batched functions of (state, inputs, X). pivots: of (state, X). channels: of
-        (time, X). features: of the state, what a force that the model lacks may follow, with its slopes. Inputs from a map of
-        the ground are no states and stand beside the torques (`inputs`).
+        (time, X). features: of the state, what a force that the model lacks may follow, with its slopes. Inputs from a
+        map of the ground are no states and stand beside the torques (`inputs`).
     """
 
     model: Model

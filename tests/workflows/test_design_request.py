@@ -86,7 +86,10 @@ def test_the_default_is_as_accurate_as_its_best_random_start(excite: Excite, tmp
 
 @pytest.mark.slow
 def test_condition_number_then_accuracy(excite: Excite, tmp_path: Path) -> None:
-    """The lowest cond(Phi) first, then the most accurate drive near it; `--cond-slack 0` stops after the first."""
+    """The lowest cond(Phi) first, then the most accurate drive near it; `--cond-slack 0` stops after the first.
+
+    A random start that is still more accurate raises cond(Phi) as far as its accuracy needs.
+    """
     options = "va12_straight", "--duration", 12, "--starts", 1, "--seed", 3, "--json"
     told = {}
     for slack in (0, 12):
@@ -97,7 +100,8 @@ def test_condition_number_then_accuracy(excite: Excite, tmp_path: Path) -> None:
     assert "lowest_cond" not in told[0]
     assert lowest["cond_phi"] == pytest.approx(told[0]["cond_phi"], rel=1e-9)
     assert lowest["worst_percent"] == pytest.approx(told[0]["worst_percent"], rel=1e-9)
-    assert told[12]["cond_phi"] <= 1.12 * lowest["cond_phi"] * 1.001
+    near = told[12]["cond_phi"] <= 1.12 * lowest["cond_phi"] * 1.001
+    assert near or told[12]["worst_percent"] <= 1.001 * told[12]["random_start_percent"]
     assert told[12]["worst_percent"] < 0.7 * lowest["worst_percent"]
     assert told[12]["max_violation"] <= 1e-3
 
