@@ -106,11 +106,18 @@ def _estimate_cell(row: Mapping[str, Any], key: str) -> str:
     return format_number(row.get(key), 2) if key.endswith("percent") else format_rounded(row.get(key), row["std"])
 
 
+def _total_percent(row: Mapping[str, Any]) -> float:
+    """Return the standard deviation of a parameter with the tolerances, in per cent of its value."""
+    return abs(row["std_percent"]) * (row.get("std_total") or row["std"]) / row["std"] if row["std"] else 0.0
+
+
 def describe_identify(s: Summary) -> Description:
     """Describe an estimate: accuracy, prediction error, bias of the method, parameters that are not identifiable."""
     rows = s["parameters"]
-    known = {n: abs(r["std_percent"]) for n, r in rows.items() if r["std_percent"] is not None}
+    known = {n: _total_percent(r) for n, r in rows.items() if r["std_percent"] is not None}
     known = {n: v for n, v in known.items() if np.isfinite(v)}
+    tolerated = any(r.get("std_total") not in (None, r["std"]) for r in rows.values())
+    with_tolerances = ", tolerances included" if tolerated else ""
     worst = max(known, key=lambda n: known[n], default="")
     every = len(known) + len(s["unidentifiable"])
     what = count(every, "parameter is", "parameters are")
@@ -118,8 +125,8 @@ def describe_identify(s: Summary) -> Description:
     logs = "one log" if len(s["logs"]) == 1 else f"{len(s['logs'])} logs"
     error = _prediction_error(s)
     accuracy = (
-        f" {format_percent(float(np.median(list(known.values()))))} (median, one standard deviation; worst {worst},"
-        f" {format_percent(known[worst])})"
+        f" {format_percent(float(np.median(list(known.values()))))} (median, one standard deviation{with_tolerances};"
+        f" worst {worst}, {format_percent(known[worst])})"
         if known
         else " no known accuracy"
     )

@@ -34,7 +34,6 @@ from support import studies
 
 from excite.errors import NoEstimateError
 from excite.identification import identify
-from excite.identification.joint import BIASED_NOTE
 from excite.logs import log
 from excite.model import Model, build
 from excite.model.machine import Machine, machine as machines
@@ -149,7 +148,6 @@ def run(s: Set, seed: int) -> dict[str, object]:
         "std": [float(f"{x:.6g}") for x in e.std],
         "interval": [[float(f"{x:.9g}") for x in end] for end in e.interval95],
         "doubt": e.status != "valid",
-        "drawn": BIASED_NOTE in e.notes,
         "seconds": seconds,
     }
 

@@ -61,7 +61,9 @@ class Task:
         self.smooth = joint_motion.with_smooth_friction(self.model)
         basis = joint_motion.BASES["fourier"](self.problem, *self.poses)
         self.program = MotionProgram(self.smooth, self.problem, self.objective, basis)
-        self.start = joint_search.best_guess(self.program, seed, lambda: False)
+        self.start = joint_search.best_guess(
+            self.program, joint_search.free_poses(self.model, self.problem), seed, lambda: False
+        )
         self.seed = seed
         self.begin = time.process_time()
         self.seconds = seconds

@@ -28,7 +28,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 from scipy.stats import binom
 
 from excite import output, smoothing
-from excite.identification import methods, summarise_runs, verify
+from excite.identification import recommend_method, summarise_runs, verify
 from excite.model import Model, prediction
 from excite.model.machine import Problem, machine
 from excite.reports import COLOURS, format_sum, legend_above, new_figure, save, set_title
@@ -145,7 +145,7 @@ def quiet(model: Model) -> Model:
 
 
 def verified(model: Model, motion: Motion, runs: int) -> dict[str, Any]:
-    method = methods.recommend_method(model)
+    method = recommend_method(model)
     found = verify(model, motion, method, "full", runs, seed=0, jobs=1)
     return {
         "method": method,
