@@ -12,4 +12,5 @@ from .prediction import (
     required_signs as required_signs,
     standard_parameters as standard_parameters,
     with_given_zeros as with_given_zeros,
+    with_least_smoothing as with_least_smoothing,
 )

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import casadi as ca
@@ -551,6 +551,29 @@ def _usual_range(body: Body) -> tuple[float, float, float]:
     if body.limit.rim_speed is not None and body.contact is not None:
         speed = float(body.limit.rim_speed) / float(body.contact.radius)
     return *(body.limit.position_range or (-1.0, 1.0)), float(speed)
+
+
+def with_least_smoothing(model: Model, least: Mapping[int, float]) -> Model:
+    """Return the model with dry friction of each joint that turns over `least` [rad/s, m/s] at the fastest.
+
+    least: by the index of the joint's body.
+    """
+    bodies = tuple(
+        b
+        if b.friction is None or float(b.friction.smoothing) >= least.get(b.index, 0.0)
+        else b.model_copy(
+            update={
+                "friction": b.friction.model_copy(
+                    update={"smoothing": Quantity(value=least[b.index], source="definition")}
+                )
+            }
+        )
+        for b in model.machine.body
+    )
+    if bodies == model.machine.body:
+        return model
+    smooth = build(model.machine.model_copy(update={"body": bodies}), model.fit_sensor_effects, model.fit_shapes)
+    return replace(smooth, nominal=model.nominal, scale=model.scale, known=model.known)
 
 
 @lru_cache(maxsize=8)

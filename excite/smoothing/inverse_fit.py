@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from excite.logs import Log, white_noise
-from excite.model import Model
+from excite.model import Model, with_least_smoothing
 from excite.smoothing.block_tridiagonal import backward
 from excite.smoothing.discrepancy import Basis, Component, Sizes, build_basis, find_sizes
 from excite.smoothing.inverse import (
@@ -25,10 +25,11 @@ from excite.smoothing.inverse import (
 from excite.smoothing.inverse_chain import TorqueModel, build_chain, torque_sensors
 from excite.smoothing.inverse_sizes import correlation_factor, update_sizes
 from excite.smoothing.log_fit import HELD_STD, MAX_IDENTIFIABLE_STD, NotConvergedError, prior_information, prior_terms
-from excite.smoothing.motion_readings import choose_knots, read_motion
+from excite.smoothing.motion_readings import JointMotion, Readings, choose_knots, read_motion, speed_std
 
 LEAST_NOISE_SHARE = 1e-3  # of the torque's root mean square; no sensor is better
-ADMITTING = (3, 6, 9)  # passes in which discrepancies of zero size are tried
+EXACT_PASSES = 15  # for the model alone, before discrepancies are tried; fewer if it settles; chosen
+ADMITTING = (0, 3, 6)  # passes after these in which discrepancies of zero size are tried
 SHOWN_SHARE = 0.6  # of the noise by third differences, to which a lively torque adds
 
 
@@ -45,7 +46,7 @@ class InverseSettings:
     time shift [rows].
     """
 
-    passes: int = 40
+    passes: int = 60
     settled: float = 0.02
     settled_size: float = 0.03
     damping: tuple[float, float] = (1e-3, 10.0)
@@ -82,7 +83,10 @@ class InverseFit:
 
 @dataclass(frozen=True)
 class State:
-    """State of the search: point, standardised discrepancy z, sizes, designs, and the slope of the log determinant."""
+    """State of the search: point, standardised discrepancy z, sizes, designs, and the slope of the log determinant.
+
+    pull (n_base,), curve_pull (n_nodes,): the slope by parameters, and by the discrepancy's values at the nodes.
+    """
 
     point: Point
     z: np.ndarray
@@ -92,6 +96,7 @@ class State:
     pull: np.ndarray
     problem: Problem
     basis: Basis | None
+    curve_pull: np.ndarray
 
 
 def fit_inverse(
@@ -106,9 +111,11 @@ def fit_inverse(
     costs: list[tuple[float, float]] = []
     held = np.zeros(len(model.nominal), bool)
     status, step = "passes", np.inf
+    first_try = EXACT_PASSES if settings.discrepancy else settings.passes
     for k in range(settings.passes):
-        state = with_designs(moved_channels(state) if 0 < k < max(ADMITTING) else state, settings, k)
-        if state.basis is not None and k not in ADMITTING and not (state.curve_sizes > 0).any():
+        admit, moving = k - first_try in ADMITTING, k <= first_try + max(ADMITTING)
+        state = with_designs(moved_channels(state) if k > 0 and moving else state, settings, admit, moving)
+        if state.basis is not None and not admit and not (state.curve_sizes > 0).any():
             state = without_curves(state)
         reduced = reduce_problem(state.problem, state.designs, state.basis, state.sizes, state.point)
         if reduced is None:
@@ -117,14 +124,17 @@ def fit_inverse(
         held = find_held(state, reduced)
         state = replace(state, problem=with_prior(state.problem, held, state.point.X))
         if state.basis is not None and settings.discrepancy:
-            found = curve_sizes(state, reduced, k in ADMITTING)
+            found = curve_sizes(state, reduced, admit)
             curve_change = _change(state.curve_sizes, found.size)
             state = replace(state, curve_sizes=found.size)
         else:
             curve_change = 0.0
-        state = with_bounded_pull(with_best_curve(state, reduced), reduced)
+        state = with_best_curve(with_bounded_pull(state, reduced), reduced)
         moved, before, after, step = descend(state, reduced, settings)
         if moved is None:
+            if k < first_try < settings.passes:
+                first_try = k + 1
+                continue
             status = "converged" if step < 10 * settings.settled and k > 3 else "stalled"
             break
         costs.append((before, after))
@@ -132,10 +142,13 @@ def fit_inverse(
         sizes, pull = new_sizes(state, reduced, first=k < 2)
         change = _sizes_change(state.sizes, sizes)
         state = replace(state, sizes=sizes, pull=pull)
-        little = 0 <= before - after < settings.settled and k > max(ADMITTING)
+        little = 0 <= before - after < settings.settled
         if k > 4 and (step < settings.settled or little) and max(change, curve_change) < settings.settled_size:
-            status = "converged"
-            break
+            if k < first_try < settings.passes:
+                first_try = k + 1
+            elif not moving or not (state.curve_sizes > 0).any():
+                status = "converged"
+                break
     return conclude(state, held, status, tuple(costs), float(step))
 
 
@@ -143,6 +156,7 @@ def first_state(model: Model, logs: Sequence[Log], settings: InverseSettings, be
     """Begin with motions by encoders alone, and least squares along them."""
     readings = [read_motion(model, log) for log in logs]
     knots, motions = choose_knots(logs, readings)
+    model = with_visible_friction(model, readings, motions)
     chains = tuple(
         build_chain(model, log, k, beside[n] if beside else ())
         for n, (log, k) in enumerate(zip(logs, knots, strict=True))
@@ -167,11 +181,33 @@ def first_state(model: Model, logs: Sequence[Log], settings: InverseSettings, be
     )
     point = Point(coefficients, model.nominal.copy(), np.zeros(n), np.zeros(0))
     designs = tuple(Design(np.zeros_like(c.torque), tuple(np.zeros((len(c.t), 0)) for _ in range(n))) for c in chains)
-    state = State(point, np.zeros(0), sizes, np.zeros(0), designs, np.zeros(len(model.nominal)), problem, None)
+    state = State(
+        point, np.zeros(0), sizes, np.zeros(0), designs, np.zeros(len(model.nominal)), problem, None, np.zeros(0)
+    )
     for _ in range(3):
         reduced = fixed_terms(state)
         state = least_squares(state, reduced)
     return state
+
+
+def with_visible_friction(
+    model: Model, readings: Sequence[Sequence[Sequence[Readings]]], motions: Sequence[JointMotion]
+) -> Model:
+    """Return the model with dry friction that turns no faster than encoders show speeds.
+
+    Where a joint nearly rests, a friction that turns within less than their errors has slopes that lead nowhere.
+    readings: by log and joint.
+    """
+    least = {}
+    for j, motion in enumerate(motions):
+        std = speed_std([own[j] for own in readings], motion)
+        body = next((b for b in model.machine.body if model.coordinates[j] in b.coordinates), None)
+        if body is not None and std is not None:
+            least[body.index] = TURNING_SHARE * std
+    return with_least_smoothing(model, least)
+
+
+TURNING_SHARE = 0.2  # of the speed's standard deviation within which dry friction turns at the fastest; chosen
 
 
 def least_noise(model: Model, logs: Sequence[Log]) -> np.ndarray:
@@ -212,8 +248,11 @@ def least_squares(state: State, reduced: Reduced) -> State:
     return replace(state, point=point, sizes=replace(state.sizes, noise=noise))
 
 
-def with_designs(state: State, settings: InverseSettings, k: int) -> State:
-    """Refresh the columns that follow the motion: alignment, discrepancy's nodes, and how encoders read edges."""
+def with_designs(state: State, settings: InverseSettings, admit: bool, moving: bool) -> State:
+    """Refresh the columns that follow the motion: alignment, discrepancy's nodes, and how encoders read edges.
+
+    admit: begin with discrepancies of zero size. moving: nodes and delays still follow the motion.
+    """
     problem = state.problem
     chains = []
     for n, chain in enumerate(problem.chains):
@@ -225,13 +264,13 @@ def with_designs(state: State, settings: InverseSettings, k: int) -> State:
     problem = replace(problem, chains=tuple(chains))
     motions = [c.motion(x) for c, x in zip(chains, state.point.coefficients, strict=True)]
     basis, point = state.basis, state.point
-    if settings.discrepancy and basis is None and k in ADMITTING:
+    if basis is None and admit:
         basis = build_basis(
             [m[:, 1] for m in motions], [m[:, 0] for m in motions], [c.t for c in chains], problem.channels
         )
         point = replace(point, curve=np.zeros(int(sum(basis.count))))
         state = replace(state, curve_sizes=np.zeros(len(basis.components)))
-    if k > max(ADMITTING):  # nodes and delays settle with the motion
+    if not moving:
         return replace(state, problem=problem)
     designs = []
     for n, (chain, motion) in enumerate(zip(chains, motions, strict=True)):
@@ -253,7 +292,8 @@ def moved_channels(state: State) -> State:
     chains = []
     for chain in state.problem.chains:
         sample = float(chain.t[1] - chain.t[0])
-        rows = np.round((state.point.shift - chain.moved * sample) / sample).astype(int)
+        off = state.point.shift / sample - chain.moved
+        rows = np.where(np.abs(off) > MOST_OFF, np.round(off), 0).astype(int)
         if not rows.any():
             chains.append(chain)
             continue
@@ -267,10 +307,20 @@ def moved_channels(state: State) -> State:
     return replace(state, problem=replace(state.problem, chains=tuple(chains)))
 
 
+MOST_OFF = 0.75  # of a row, until which a channel stays: at half a row it would go to and fro; chosen
+
+
 def without_curves(state: State) -> State:
     """Return the state without the columns of discrepancies, which are all of size zero."""
     designs = tuple(replace(d, nodes=tuple(x[:, :0] for x in d.nodes)) for d in state.designs)
-    return replace(state, designs=designs, basis=None, z=np.zeros(0), point=replace(state.point, curve=np.zeros(0)))
+    return replace(
+        state,
+        designs=designs,
+        basis=None,
+        z=np.zeros(0),
+        point=replace(state.point, curve=np.zeros(0)),
+        curve_pull=np.zeros(0),
+    )
 
 
 def with_prior(problem: Problem, held: np.ndarray, X: np.ndarray) -> Problem:
@@ -337,14 +387,18 @@ def find_held(state: State, reduced: Reduced) -> np.ndarray:
 
 
 def curve_sizes(state: State, reduced: Reduced, admit: bool) -> Sizes:
-    """Find the sizes of the discrepancy's components, parameters and shifts integrated out."""
+    """Find the sizes of the discrepancy's components, parameters and shifts integrated out.
+
+    Without the slope of the log determinant, which curves have as well: it would count as evidence for those that
+    parameters can make.
+    """
     assert state.basis is not None
     if not admit and not (state.curve_sizes > 0).any():
         return Sizes(state.curve_sizes, state.curve_sizes)
     p = len(state.point.X) + state.problem.channels
     S, h = reduced.information, reduced.slope.copy()
     h += S[:, p:] @ state.point.curve
-    prior, slope = _priors(state, p)
+    prior, slope = _priors(replace(state, pull=np.zeros(len(state.pull))), p)
     outer = S[:p, :p] + prior
     gain = np.linalg.solve(outer, np.column_stack([S[:p, p:], h[:p] - slope]))
     information = S[p:, p:] - S[p:, :p] @ gain[:, :-1]
@@ -360,7 +414,7 @@ def with_best_curve(state: State, reduced: Reduced) -> State:
     p = len(state.point.X) + state.problem.channels
     root = _root(state)
     C = reduced.fixed_information[p:, p:]
-    h = reduced.fixed_slope[p:] + C @ state.point.curve
+    h = reduced.fixed_slope[p:] + C @ state.point.curve - state.curve_pull
     z = np.linalg.solve(root.T @ C @ root + np.eye(root.shape[1]), root.T @ h)
     return replace(state, z=z, point=replace(state.point, curve=root @ z))
 
@@ -368,20 +422,23 @@ def with_best_curve(state: State, reduced: Reduced) -> State:
 def with_bounded_pull(state: State, reduced: Reduced) -> State:
     """Return the state with a slope of the log determinant that moves no parameter by more than its deviation.
 
-    The slope holds near the state only: along what a discrepancy hides, it would pull parameters without end.
+    The slope holds near the state only. It moves parameters as it does without discrepancies, which keep their values:
+    these have slopes as well, and parameters that they hide would be pulled without end.
     """
-    information, slope, _ = _split(state, reduced.information, reduced.slope)
-    p = len(state.pull)
-    covariance = np.linalg.inv(information + _priors(state, len(slope))[0])[:p, :p]
-    size = float(np.sqrt(max(state.pull @ covariance @ state.pull, 0.0)))
-    return replace(state, pull=state.pull / max(size, 1.0))
+    p, n = len(state.pull), len(state.pull) + state.problem.channels
+    information = reduced.information[:n, :n] + _priors(state, n)[0]
+    step = np.linalg.solve(information, np.concatenate([state.pull, np.zeros(n - p)]))
+    share = 1 / max(float(np.sqrt(max(state.pull @ step[:p], 0.0))), 1.0)
+    curve_pull = share * reduced.information[n:, :n] @ step
+    return replace(state, pull=share * state.pull, curve_pull=curve_pull)
 
 
 def descend(state: State, reduced: Reduced, settings: InverseSettings) -> tuple[State | None, float, float, float]:
     """Take a step that lowers the cost; return the state, the costs before and after, and the undamped step [std]."""
 
     def cost(point: Point, z: np.ndarray) -> float:
-        return cost_of(state.problem, state.designs, state.basis, state.sizes, state.pull, point, z)
+        cost = cost_of(state.problem, state.designs, state.basis, state.sizes, state.pull, point, z)
+        return cost + 2 * float(state.curve_pull @ point.curve)
 
     before = cost(state.point, state.z)
     damping, growth = 0.0, settings.damping[1]
@@ -424,6 +481,7 @@ def propose(state: State, reduced: Reduced, damping: float) -> tuple[Point, np.n
     p, n = len(point.X), state.problem.channels
     information, slope, T = _split(state, reduced.information, reduced.slope)
     prior, pull = _priors(state, len(slope))
+    pull[p + n :] = T[p + n :, p + n :].T @ state.curve_pull
     total = information + prior
     size = np.sqrt(np.diag(total))
     std = np.sqrt(np.maximum(np.diag(np.linalg.inv(total / np.outer(size, size))), 0.0))[:p] / size[:p]

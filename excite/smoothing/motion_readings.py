@@ -261,6 +261,22 @@ class JointMotion:
     log_likelihood: float
 
 
+def speed_std(readings: Sequence[Sequence[Readings]], motion: JointMotion) -> float | None:
+    """Return the standard deviation of a joint's smoothed speed [rad/s, m/s]; None without readings of its position.
+
+    readings: of the joint in each log. With positions of information density 1 / R [1/SI^2 s] and white jerk of
+    intensity r, the error of the speed has the spectrum w^2 R / (1 + w^6 R / r), whose integral is sqrt(r R) / 6.
+    """
+    information, time = 0.0, 0.0
+    for own in readings:
+        positions = [r for r in own if r.derivative == 0]
+        information += sum(float(((motion.level[r.sensor] * r.std) ** -2.0).sum()) for r in positions)
+        time += max((float(np.ptp(r.t)) for r in positions), default=0.0)
+    if not (information > 0 and time > 0):
+        return None
+    return float(np.sqrt(np.sqrt(motion.jerk * time / information) / 6))
+
+
 def smooth_joint(
     knots: Sequence[Knots], readings: Sequence[Sequence[Readings]], before: JointMotion | None = None
 ) -> JointMotion | None:

@@ -28,8 +28,8 @@ from scipy.interpolate import BSpline
 from scipy.optimize import minimize
 
 from excite.errors import SimulationError
-from excite.model import Model, build
-from excite.model.machine import Problem, Quantity
+from excite.model import Model, with_least_smoothing
+from excite.model.machine import Problem
 from excite.simulation import Motion, inverse_dynamics, motion_along, play_back
 from excite.trajectories import composite_objective
 from excite.trajectories.clearance import random_poses
@@ -250,18 +250,9 @@ def violations_as_followed(model: Model, problem: Problem, motion: Motion) -> di
     return {n: x for n, x in check_limits(model, problem, followed).items() if n in names}
 
 
-def with_smooth_friction(model: Model, least: float = FRICTION_RATE) -> Model:
-    """Return the model with dry friction that turns over `least` [rad/s, m/s] at the fastest."""
-    bodies = tuple(
-        b
-        if b.friction is None or float(b.friction.smoothing) >= least
-        else b.model_copy(
-            update={"friction": b.friction.model_copy(update={"smoothing": Quantity(value=least, source="definition")})}
-        )
-        for b in model.machine.body
-    )
-    smooth = build(model.machine.model_copy(update={"body": bodies}), model.fit_sensor_effects, model.fit_shapes)
-    return replace(smooth, nominal=model.nominal, scale=model.scale)
+def with_smooth_friction(model: Model) -> Model:
+    """Return the model with dry friction that turns over `FRICTION_RATE` at the fastest."""
+    return with_least_smoothing(model, dict.fromkeys((b.index for b in model.machine.body), FRICTION_RATE))
 
 
 class MotionProgram:

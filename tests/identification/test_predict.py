@@ -82,11 +82,14 @@ def covered(model: Model, fitted: Motion, target: Motion, seed: int) -> tuple[fl
 
 @pytest.mark.slow
 def test_bands_hold_the_truth_on_a_rig(rig: Model) -> None:
-    """Torques along a log, and along a drive the torque that the motion needs, speed and position."""
+    """Torques along a log, and along a drive the torque that the motion needs, speed and position.
+
+    Errors along a drive are those of ten estimates, each inside or outside nearly all along.
+    """
     fitted, target = swing(rig, 0.8, 1.7), swing(rig, 0.6, 2.1)
     shares = np.mean([covered(rig, fitted, target, seed) for seed in range(SEEDS)], axis=0)
     assert (shares >= 0.90).all(), shares
-    assert (shares <= 0.99).all(), shares
+    assert (shares[:2] <= 0.99).all(), shares
 
 
 @pytest.mark.slow
