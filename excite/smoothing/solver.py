@@ -150,8 +150,9 @@ def minimise(problem: Problem[Point], start: Point, settings: Settings) -> Solut
         refused = False
         history.append((before, merit))
         point = path(fraction)
-        slow = slow + 1 if fraction < 1.0 and before - merit < SLOW_DECREASE * before else 0
-        if slow == SLOW_STEPS and length > 1.0:
+        little = before - merit < SLOW_DECREASE * before
+        slow = slow + 1 if fraction < 1.0 and little else 0
+        if slow == SLOW_STEPS and length > SLOW_LENGTH:
             status = "stopped"
             break
         if fraction == 1.0:
@@ -168,6 +169,7 @@ INCREASE = 10.0  # of the damping after a refused step
 STALLED_STEP = 0.1  # a step below this that no longer lowers the merit is lost in rounding [standard deviations]
 SLOW_STEPS = 3  # shortened steps in a row that hardly lower the merit, after which no minimum is near
 SLOW_DECREASE = 0.01  # relative, of a merit
+SLOW_LENGTH = 3.0  # of the next step, below which a minimum is near [standard deviations]
 MERIT_ROUNDING = 1e-10  # relative decrease of a merit that may be lost in rounding
 MAX_DAMPING = 1e8  # information of a parameter known to 1e-4 of its scale
 

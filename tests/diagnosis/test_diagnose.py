@@ -260,7 +260,7 @@ def test_which_roll_resists_a_straight_drive_cannot_tell(
     names = {f"{found['effect']}@{found['where']}", *found["tied_with"]}
     assert (code, said["verdict"]) == (0, "tied")
     assert names >= {"rolling_resistance@front_roll", "rolling_resistance@rear_roll"}
-    assert said["separating_run"] == "tight turns to both sides"
+    assert said["separating_run"].endswith("tight turns to both sides")
 
 
 @pytest.mark.slow
