@@ -21,12 +21,13 @@ from typing import Any, Self
 import joblib
 import numpy as np
 
-from excite.errors import InfeasibleError, SolverError
+from excite.errors import InfeasibleError, MachineError, SolverError
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion, simulate
 from excite.text import format_number, format_percent
 from excite.trajectories import composite_objective, objective as objectives
+from excite.trajectories.clearance import random_poses
 from excite.trajectories.composite_objective import SIGMA_MAX, CompositeObjective
 from excite.trajectories.continuation import (
     SCREENING_STAGES,
@@ -43,7 +44,14 @@ from excite.trajectories.continuation import (
     start_from_multisine,
 )
 from excite.trajectories.excitation import Manoeuvre
-from excite.trajectories.limits import describe_excess, move_motion, place_along_lane
+from excite.trajectories.limits import (
+    LIGHTEN,
+    describe_excess,
+    describe_overload,
+    end_poses,
+    move_motion,
+    place_along_lane,
+)
 
 
 class BestSoFar(float):
@@ -58,6 +66,7 @@ class BestSoFar(float):
 
 
 Report = Callable[[int, int, BestSoFar], None]
+OVERLOAD_POSES = 1000  # random poses in which gravity is looked at where a drive exceeds a torque limit
 MIN_LATER_STEPS = len(STAGES) - SCREENING_STAGES + 1  # progress reports of a selected start, at least
 
 
@@ -115,13 +124,16 @@ def design(
     The same seed gives the same design unless the search is cut short.
 
     Raises InfeasibleError with the limit and its excess, SolverError if the solver ended without an optimum from every
-    start, KeyError for an unknown objective or solver.
+    start, KeyError for an unknown objective or solver, MachineError for a machine whose drives do not hold its weight.
     """
     if solver not in SOLVERS:
         raise KeyError(f"no solver {solver}, allowed: {', '.join(SOLVERS)}")
     composite = composite_objective.compose_objective(model, objective) if isinstance(objective, str) else objective
     if starts < (0 if warm else 1):
         raise ValueError(f"starts must be at least 1, got {starts}")
+    overload = "" if model.follows_positions else describe_overload(model, np.array(end_poses(model, problem)))
+    if overload:
+        raise MachineError(f"{model.machine.name}: no drive can hold it: {overload}; {LIGHTEN}")
     now = time.time()
     half, deadline = (None, None) if budget_s is None else (now + budget_s / 2, now + budget_s)
     seeds = np.random.SeedSequence(seed).generate_state(starts)
@@ -233,6 +245,14 @@ def infeasible_error(
             f" {format_percent(100 * excess)}, the worst parameter comes out at"
             f" {format_percent(objective.sigma_max * (1 + excess), 3)} in the best attempt;"
             f" {'allow more, or give a longer duration or more starts' if complete else cut}",
+            name,
+            excess,
+        )
+    overload = describe_overload(model, random_poses(model, OVERLOAD_POSES)) if name.startswith("torque u") else ""
+    if overload:
+        return InfeasibleError(
+            f"no drive found that keeps every limit: {describe_excess(model, name, excess)} in the best attempt:"
+            f" {overload}; narrow position_low and position_high to poses that it can hold, or {LIGHTEN}",
             name,
             excess,
         )
