@@ -182,7 +182,7 @@ def design_joint_motion(
     complete = len(states) == starts and all(t.complete for t in states.values())
     if best.best.excess > TOLERANCE:
         if interrupted:
-            raise KeyboardInterrupt(no_drive_yet(best.best.violations))
+            raise KeyboardInterrupt(no_drive_yet(model, best.best.violations))
         raise infeasible_error(model, composite, best.best.violations, complete)
     chosen = keep_as_followed(model, problem, composite, best.best)
     states[best.number] = replace(best, best=chosen)
@@ -245,7 +245,7 @@ def _run_start(
     state = None
     for k, found in enumerate(search(model, problem, objective, trajectory, seed, should_stop)):
         state = replace(found, number=number)
-        write_stage(stop, number, k, _reported(objective, state.best), state.best.violations)
+        write_stage(model, stop, number, k, _reported(objective, state.best), state.best.violations)
     return state
 
 

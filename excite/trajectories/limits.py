@@ -401,15 +401,33 @@ def _rest(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
     return still | {f"rest {model.coordinates[k]}": max(0.0, float(away[k])) for k in given}
 
 
-def describe_excess(model: Model, name: str, excess: float) -> str:
-    """Say by how much a drive exceeds a limit; of rest at the ends, how fast it moves or how far it is off."""
+def describe_excess(model: Model, name: str, excess: float, end: str = "the end") -> str:
+    """Say by how much a drive exceeds a limit; of rest, how fast it moves at an end or how far it is off its pose."""
     for k, c in enumerate(model.coordinates):
         unit = "rad" if c.startswith("theta") else "m"
         if name == f"rest {c}'":
-            return f"{c} still moves at {format_number((1 + excess) * rest_tolerances(model)[k], 3)} {unit}/s at an end"
+            speed = format_number((1 + excess) * rest_tolerances(model)[k], 3)
+            return f"{c} {'still moves' if end == 'the end' else 'moves'} at {speed} {unit}/s at {end}"
         if name == f"rest {c}":
-            return f"{c} is {format_number((1 + excess) * REST_POSITION, 3)} {unit} off its pose at an end"
+            return f"{c} is {format_number((1 + excess) * REST_POSITION, 3)} {unit} off its pose at {end}"
     return f"{name} is exceeded by {100 * excess:.2f} % of its range"
+
+
+def excesses_in_units(
+    model: Model, problem: Problem, motion: Motion, violations: Mapping[str, float]
+) -> dict[str, str]:
+    """Say in units what a share of a range does not: rest at the ends, the duration; by limit, those not kept."""
+    found = {}
+    for name, excess in violations.items():
+        if excess > TOLERANCE and is_rest_limit(name):
+            k = model.coordinates.index(name.removeprefix("rest ").removesuffix("'"))
+            moving = name.endswith("'")
+            off = np.abs(motion.nu[[0, -1]] if moving else motion.q[[0, -1]] - end_poses(model, problem))[:, k]
+            found[name] = describe_excess(model, name, excess, "the start" if off[0] > off[1] else "the end")
+        elif excess > TOLERANCE and name == DURATION_LIMIT:
+            lasts, wanted = float(motion.t[-1] - motion.t[0]), float(problem.duration_s)
+            found[name] = f"it lasts {lasts:g} s, and the problem asks for {wanted:g} s"
+    return found
 
 
 def describe_overload(model: Model, poses: np.ndarray) -> str:

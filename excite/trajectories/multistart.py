@@ -165,9 +165,9 @@ def design(
     best = min(states.values(), key=lambda t: (t.failure is not None, *rank(t.best), t.number))
     complete = len(states) == len(guesses) and all(states[t.number].complete for t in chosen)
     if not best.best.feasible and interrupted:
-        raise KeyboardInterrupt(no_drive_yet(best.best.violations))
+        raise KeyboardInterrupt(no_drive_yet(model, best.best.violations))
     if best.failure is not None:
-        raise _no_optimum(solver, best, len(guesses))
+        raise _no_optimum(model, solver, best, len(guesses))
     if not best.best.feasible:
         raise infeasible_error(model, composite, best.best.violations, complete)
     drive = best.best
@@ -211,25 +211,21 @@ def _screening_order(state: SearchState) -> tuple[bool, float, int]:
     return state.failure is not None, selection_score(state.latest), state.number
 
 
-def _no_optimum(solver: str, best: SearchState, starts: int) -> SolverError:
+def _no_optimum(model: Model, solver: str, best: SearchState, starts: int) -> SolverError:
     """Build the error of a solver that ended without an optimum from every start."""
     name = max(best.latest.violations, key=lambda limit: best.latest.violations[limit])
     excess = best.latest.excess
-    where = (
-        f", where {name} is exceeded by {format_number(100 * excess, 2)} % of its range"
-        if not best.latest.feasible
-        else ""
-    )
+    where = f", where {describe_excess(model, name, excess)}" if not best.latest.feasible else ""
     return SolverError(
         f"{solver} found no optimum from any of the starts ({starts}), the best ended with {best.failure}{where};"
         " give more starts or another seed, or take the other solver"
     )
 
 
-def no_drive_yet(violations: Mapping[str, float]) -> str:
+def no_drive_yet(model: Model, violations: Mapping[str, float]) -> str:
     """Say why there is no drive yet: the limit that is exceeded most, and by how much."""
     name = max(violations, key=lambda limit: violations[limit])
-    return f"no drive within all limits yet: {name.replace('_', ' ')} {format_percent(100 * violations[name], 2)} over"
+    return f"no drive within all limits yet: {describe_excess(model, name, violations[name])}"
 
 
 def infeasible_error(
@@ -326,12 +322,14 @@ def begin_worker(stop: Path, deadline: float | None) -> Callable[[], bool]:
     return lambda: stop.exists() or (deadline is not None and time.time() > deadline)
 
 
-def write_stage(stop: Path, number: int, stage: int, score: float, violations: Mapping[str, float]) -> None:
+def write_stage(
+    model: Model, stop: Path, number: int, stage: int, score: float, violations: Mapping[str, float]
+) -> None:
     """Write the best score of a start after a stage beside the stop file, for `progress_reports`.
 
     violations: of the drive that has this score.
     """
-    excess, over = max(violations.values(), default=0.0), no_drive_yet(violations) if violations else ""
+    excess, over = max(violations.values(), default=0.0), no_drive_yet(model, violations) if violations else ""
     fresh = stop.parent / f".{number}"
     fresh.write_text(f"{score!r}\n{excess!r}\n{over}", encoding="utf-8")
     fresh.replace(stop.parent / f"{number}-{stage}")
@@ -356,7 +354,7 @@ def _run_start(
     stages = itertools.count(0 if state is None else SCREENING_STAGES)
 
     def report_stage(state: SearchState) -> None:
-        write_stage(stop, number, next(stages), _score(objective, state.best), state.best.violations)
+        write_stage(model, stop, number, next(stages), _score(objective, state.best), state.best.violations)
 
     if state is None:
         if number > 0 and should_stop():

@@ -1180,7 +1180,7 @@ def _find(name: str) -> Path:
 def _similar_machine(path: Path) -> str:
     """Return " (did you mean X?)" for a wrong name: a machine file in the same folder, or a shipped machine."""
     here = [p for p in sorted(path.parent.glob("*.toml")) if is_machine_file(p)]
-    known = {stem: name for stem, name in [*((n, n) for n in shipped_machines()), *((p.stem, str(p)) for p in here)]}
+    known = {n: n for n in shipped_machines()} | {p.stem: str(p) for p in here}
     spelt = {f"{stem}{end}".lower(): name for stem, name in known.items() for end in (".toml", "")}
     like = closest(path.name.lower(), spelt)
     return f" (did you mean {spelt[like]}?)" if like else ""

@@ -719,5 +719,5 @@ def test_a_misspelt_machine_suggests_a_machine_file_or_a_shipped_one(
     }.items():
         with pytest.raises(MachineError, match=rf"did you mean {right}\?"):
             load_machine(wrong)
-    with pytest.raises(MachineError, match="allowed: .*, or a path to a .toml file$"):
+    with pytest.raises(MachineError, match=r"allowed: .*, or a path to a \.toml file$"):
         load_machine("qqq")

@@ -232,7 +232,12 @@ def test_design_takes_zeros_that_no_torque_shows_from_the_file(arm: Model, probl
 RIG = ARM.with_name("rig.toml")
 OVERLOADED = {
     "slide": (RIG, 'value = "pi/2"', "value = 0", "carriage with 933 N in every pose, .* limit of 150 N; raise torque"),
-    "given pose": (ARM, "value = 40,", "value = 8,", r"upper_arm with 16 N m at theta1 -0\.4 rad, theta2 0\.5 rad, .* 8"),
+    "given pose": (
+        ARM,
+        "value = 40,",
+        "value = 8,",
+        r"upper_arm with 16 N m at theta1 -0\.4 rad, theta2 0\.5 rad, .* 8",
+    ),
     "chosen pose": (
         ARM,
         "value = 40,",
