@@ -349,8 +349,8 @@ def compare(
 ) -> ShownComparison:
     """Compare the designed drive with the usual ones on the same problem, limits and time.
 
-    against: names of `excite.trajectories.BASELINES`, and profiles (.csv) or folders of designs; all the usual drives if not
-    given. samples: drives of every random kind.
+    against: names of `excite.trajectories.BASELINES`, and profiles (.csv) or folders of designs; all the usual drives
+    if not given. samples: drives of every random kind.
     Raises UsageError for an unknown name, MachineError for sensors of unknown noise.
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine

@@ -25,7 +25,7 @@ from excite.errors import InfeasibleError, MachineError, SolverError
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion, simulate
-from excite.text import format_number, format_percent
+from excite.text import format_percent
 from excite.trajectories import composite_objective, objective as objectives
 from excite.trajectories.clearance import random_poses
 from excite.trajectories.composite_objective import SIGMA_MAX, CompositeObjective
