@@ -310,19 +310,25 @@ def verify(
 
 
 def score(
-    machine: Machine, drive: Drive, problem: str | None = None, *, sensors: bool = False, kit: str = "full"
+    machine: Machine,
+    drive: Drive,
+    problem: str | None = None,
+    *,
+    duration: float | None = None,
+    sensors: bool = False,
+    kit: str = "full",
 ) -> ShownScore:
     """Judge any drive as a design: condition numbers, attainable accuracy, limits, on a fresh simulation.
 
     drive: as in `simulate`; one that gives no pose is placed on the lane as a design is. problem: a design problem of
-    the machine file, its default one if not given. sensors: also find what each sensor of a kit buys, in
-    `summary["sensors"]`, printed and drawn (`plot("sensors")`).
+    the machine file, its default one if not given. duration [s]: the problem's own if not given. sensors: also find
+    what each sensor of a kit buys, in `summary["sensors"]`, printed and drawn (`plot("sensors")`).
     Raises LogError for a profile, MachineError for sensors of unknown noise, UsageError for an unknown problem or kit,
     SimulationError for a motion that can't be integrated.
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
     model, zeros = workflows.without_hidden_zeros(model)
-    name, chosen = workflows.choose_problem(model.machine, problem, None)
+    name, chosen = workflows.choose_problem(model.machine, problem, duration)
     workflows.require_noise_figures(model)
     given = _planned(model, drive, any_rate=True)
     found = trajectories.score(model, chosen, given.torque, given.start, given.nu0, given.planned)
@@ -343,8 +349,8 @@ def compare(
 ) -> ShownComparison:
     """Compare the designed drive with the usual ones on the same problem, limits and time.
 
-    against: names of `excite.trajectories.BASELINES` and profiles (.csv) of your own; all the usual drives if not
-    given. samples: drives of every random kind.
+    against: names of `excite.trajectories.BASELINES`, and profiles (.csv) or folders of designs; all the usual drives
+    if not given. samples: drives of every random kind.
     Raises UsageError for an unknown name, MachineError for sensors of unknown noise.
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
@@ -389,8 +395,6 @@ def _target(model: Model, target: Source | Drive) -> Source | PlannedDrive:
     """Return what a prediction is along: a log or profile as it is, any other drive with its planned motion."""
     if isinstance(target, np.ndarray | Design | Motion):
         return _planned(model, target)
-    if isinstance(target, str | Path) and (Path(target) / "profile.csv").is_file():
-        return Path(target) / "profile.csv"
     return target
 
 
@@ -406,10 +410,7 @@ def _planned(model: Model, drive: Drive, any_rate: bool = False) -> PlannedDrive
         drive = drive.motion
     if isinstance(drive, Motion):
         return PlannedDrive(drive.u, drive.q[0], drive.nu[0], drive.q, drive.nu)
-    if isinstance(drive, pd.DataFrame):
-        return readers.read_drive(drive, model, any_rate)
-    path = Path(drive)
-    return readers.read_drive(path / "profile.csv" if path.is_dir() else path, model, any_rate)
+    return readers.read_drive(drive, model, any_rate)
 
 
 def _motion(model: Model, drive: Drive) -> Motion:

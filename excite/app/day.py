@@ -12,7 +12,8 @@ from excite import output, workflows
 from excite.app.job import Job
 from excite.app.results import Result, is_readable_file, read_result, read_stored
 from excite.errors import MachineError
-from excite.model.machine import MACHINES, Machine, load_machine, machine_files, shipped_machines
+from excite.logs import SUFFIXES
+from excite.model.machine import MACHINES, Machine, is_machine_file, load_machine, machine_files, shipped_machines
 
 MOST_PASSED_OVER = 20  # lines about what no step can show
 MAX_NAME = 60  # letters of a result's name: of four bytes each they fit into a file name
@@ -25,7 +26,6 @@ STEPS = {
     "identify": "Identify",
     "diagnose": "Diagnose",
 }
-LOG_ENDINGS = (".csv", ".txt", ".parquet", ".mat", ".mf4", ".xlsx", ".h5", ".hdf5", ".bag", ".mcap", ".blf", ".asc")
 PROFILE_FILES = ("profile.csv", "phases.csv", "covariance.csv", "prediction.csv")  # tables that are no logs
 
 
@@ -135,7 +135,7 @@ class Day:
                 elif result is not None:
                     odd.append(result)
         for path in sorted(self.folder.glob("*")):
-            if path.suffix.lower() in (*LOG_ENDINGS, ".toml") and not path.is_file():
+            if path.suffix.lower() in (*SUFFIXES, ".toml") and not path.is_file():
                 odd.append(f"{path}: is no file")
         self.passed_over = sorted(odd)[:MOST_PASSED_OVER]
         return sorted(found, key=lambda r: (-r.time, str(r.folder)))
@@ -156,7 +156,7 @@ class Day:
         here = Path()
         files = [*sorted(self.folder.glob("*.toml")), *(sorted(here.glob("*.toml")) if self.folder != here else ())]
         chosen = [self.machine] if self.machine and self.machine.endswith(".toml") else []
-        own = [str(f) for f in files if _is_machine_file(f)]
+        own = [str(f) for f in files if is_machine_file(f)]
         return list(dict.fromkeys([*own, *chosen, *shipped_machines()]))
 
     def load(self) -> Machine | None:
@@ -206,7 +206,7 @@ class Day:
 
     def known_logs(self) -> list[str]:
         """Return the logs to choose from: those in the folder, checked before, or chosen."""
-        there = [str(p) for p in sorted(self.folder.glob("*")) if p.suffix.lower() in LOG_ENDINGS and p.is_file()]
+        there = [str(p) for p in sorted(self.folder.glob("*")) if p.suffix.lower() in SUFFIXES and p.is_file()]
         checked = [r.summary["log"] for r in self.results("log") if is_readable_file(r.summary["log"])]
         return sorted(path for path in {*self.logs, *there, *checked} if Path(path).name not in PROFILE_FILES)
 
@@ -439,12 +439,3 @@ def _alike(usual: Any, kept: Any) -> bool:
 
 def _same(one: str | Path, other: str | Path) -> bool:
     return Path(one).resolve() == Path(other).resolve()
-
-
-def _is_machine_file(path: Path) -> bool:
-    """Return True for a TOML file that describes a machine, however wrong."""
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
-    except OSError:
-        return False
-    return "[[body]]" in text or text.startswith("extends") or "\nextends" in text

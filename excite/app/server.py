@@ -18,9 +18,10 @@ from typing import Any
 from urllib.parse import quote
 
 from excite import output
-from excite.app.day import LOG_ENDINGS, Day
+from excite.app.day import Day
 from excite.app.results import is_possible_name
 from excite.errors import FolderError, ServeError, UsageError
+from excite.logs import ENDINGS, SUFFIXES
 
 HOST = "127.0.0.1"
 TOKEN_BYTES = 24  # random bytes in the address; chosen
@@ -115,8 +116,8 @@ def web_app(day: Day) -> Any:
     async def log(request: Any) -> Any:
         name = Path(request.path_params["name"].replace("\\", "/")).name
         path = day.folder / name
-        if path.suffix.lower() not in LOG_ENDINGS or name.startswith(".") or not is_possible_name(name):
-            said = f"{name[:60]}: is no name for a log, which ends in {', '.join(LOG_ENDINGS)}"
+        if path.suffix.lower() not in SUFFIXES or name.startswith(".") or not is_possible_name(name):
+            said = f"{name[:60]}: is no name for a log, which ends in {ENDINGS}"
             return PlainTextResponse(said, 400)
         taken = f"{path}: exists already; rename the log, or choose it in the list"
         if path.exists():

@@ -61,7 +61,9 @@ def design(
     ] = None,
     of: Annotated[
         Path | None,
-        typer.Option("--of", help="profile (.csv) or design folder of the drive that --objective prediction is about"),
+        typer.Option(
+            "--of", help="profile (.csv), or a design's folder, of the drive that --objective prediction is about"
+        ),
     ] = None,
     target: Annotated[
         list[str] | None,
@@ -209,7 +211,8 @@ def compare(
         list[str] | None,
         typer.Option(
             "--against",
-            help="usual drive or profile (.csv) of your own to compare with (repeatable); all usual ones by default",
+            help="usual drive, or a profile (.csv) or design's folder to compare with (repeatable); all usual ones by"
+            " default",
             autocompletion=options.names("against"),
         ),
     ] = None,
@@ -225,7 +228,7 @@ def compare(
     Example: excite compare va12 --against multisine --against my.csv
     """
     out = out or Path(f"results/compare-{workflows.machine_stem(machine)}")
-    inputs = [*machine_file(machine), *(Path(name) for name in against or () if Path(name).suffix)]
+    inputs = [*machine_file(machine), *(Path(name) for name in against or () if workflows.is_own_drive(name))]
     with result_folder(out, json, partial(terminal.show, "compare"), inputs) as (place, summary):
         summary |= workflows.compare(place, machine, problem, samples, tuple(against or ()), seed, budget, terminal.bar)
 
@@ -234,9 +237,11 @@ def compare(
 def score(
     machine: MachineArgument,
     profile: Annotated[
-        Path, typer.Argument(metavar="PROFILE.csv", help="torques over time, as in a design's profile.csv")
+        Path,
+        typer.Argument(metavar="PROFILE", help="torques over time (.csv), as in a design's folder, or that folder"),
     ],
     problem: ProblemOption = None,
+    duration: DurationOption = None,
     sensors: Annotated[
         bool,
         typer.Option("--sensors", help="also find what each sensor of --kit buys: left out, added, twice as accurate"),
@@ -258,7 +263,7 @@ def score(
         place,
         summary,
     ):
-        summary |= workflows.score(place, machine, profile, problem, sensors, kit)
+        summary |= workflows.score(place, machine, profile, problem, sensors, kit, duration)
 
 
 @commands.command(cls=DrawingCommand)
@@ -393,7 +398,8 @@ def drive(
 def simulate(
     machine: MachineArgument,
     profile: Annotated[
-        Path, typer.Argument(metavar="PROFILE.csv", help="torques over time, as in a design's profile.csv")
+        Path,
+        typer.Argument(metavar="PROFILE", help="torques over time (.csv), as in a design's folder, or that folder"),
     ],
     out: Annotated[Path, typer.Option("--out", help="log to write (.csv or .parquet)")],
     seed: SeedOption = 0,
@@ -425,7 +431,7 @@ def simulate(
     Example: excite simulate va12 results/design-va12/profile.csv --out log.csv
     """
     from excite import output, reports, simulation
-    from excite.logs import read_drive
+    from excite.logs import drive_file, read_drive
 
     if noise not in ("on", "off"):
         raise UsageError(f"--noise: {noise} is unknown, allowed: on, off")
@@ -433,7 +439,7 @@ def simulate(
     workflows.require_known("--friction", friction, simulation.FRICTION_LAWS)
     workflows.require_known("--out: ending", out.suffix.lower(), tuple(TABLE_WRITERS))
     model = workflows.build_model(machine)
-    if out.resolve() in [path.resolve() for path in (profile, *machine_file(machine))]:
+    if out.resolve() in [path.resolve() for path in (drive_file(profile), *machine_file(machine))]:
         raise UsageError(f"--out {out}: is what the log is made from, choose another file")
     planned = read_drive(profile, model)
     nominal, model = model, workflows.with_effects(model, effect or (), len(planned.torque))
@@ -444,6 +450,7 @@ def simulate(
         )
         table = simulation.measure(model, motion, kit=kit, seed=seed, noise=noise == "on")
         TABLE_WRITERS[out.suffix.lower()](table, path)
+    violations = workflows.judge_limits(model, motion, placed=planned.placed)
     summary = {
         "machine": model.machine.name,
         "profile": str(profile),
@@ -456,7 +463,8 @@ def simulate(
         "effects": effect or [],
         "friction": friction,
         "doubts": doubts,
-        "violations": workflows.judge_limits(model, motion, placed=planned.placed),
+        "violations": violations,
+        "excesses": workflows.excesses(model, motion, violations),
         "share_outside_law": simulation.share_outside_law(model, motion),
         "seed": seed,
     }

@@ -94,7 +94,6 @@ def predict(
 
     name = read_estimate(result).model.machine.name
     out = out or Path(f"results/predict-{name}")
-    target = target / "profile.csv" if (target / "profile.csv").is_file() else target
     with result_folder(out, json, partial(terminal.show, "predict"), [result, target]) as (place, summary):
         summary |= workflows.predict(place, result, target, terminal.bar)
 

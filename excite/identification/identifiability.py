@@ -46,9 +46,13 @@ def add_advice(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Fi
     motions = [samples(model, log, filter) for log in logs]
     advised = advise_manoeuvres(model, motions, [*estimate.unidentifiable, *poor])
     reasons = {n: f"{reason}; {advised[n]}" for n, reason in estimate.unidentifiable.items()}
+    together: dict[str, list[str]] = {}
+    for n in poor:
+        together.setdefault(advised[n], []).append(n)
     notes = tuple(
-        f"{n}: poorly identified from this log (standard deviation > {100 * POOR_RELATIVE_STD:g} %); {advised[n]}"
-        for n in poor
+        f"{', '.join(names)}: poorly identified from this log (standard deviation > {100 * POOR_RELATIVE_STD:g} %);"
+        f" {advice}"
+        for advice, names in together.items()
     )
     return add_notes(replace(estimate, unidentifiable=reasons), *notes)
 
@@ -157,7 +161,7 @@ def advise_manoeuvres(model: Model, logs: Sequence[Samples], names: Sequence[str
         sizes = np.array([_independent_size(t / level, k) for t in extended])
         gains = sizes - _independent_size(regressor / level, k)  # beyond what the log shows by itself
         if not gains.max(initial=0.0) > 1e-6:
-            advised[name] = "no manoeuvre that was tried identifies it apart from the others"
+            advised[name] = "no manoeuvre that was tried tells this apart from the other parameters"
             continue
         best = options[int(np.argmax(gains >= SUFFICIENT_SHARE * gains.max()))]
         resting = [c for k, c in enumerate(model.coordinates) if at_rest[k] and k in best.coordinates]

@@ -39,6 +39,11 @@ UNIT_FACTORS = (
 )
 LEAST_GEAR = 2.0  # ratio from whose square on values off by it are no chance; chosen
 SQUARE_TOLERANCE = 0.2  # relative deviation of values from the square of a gear ratio; chosen
+STANDS = 0.01  # share of a joint's largest speed below which it stands; chosen
+STANDS_S = 0.2  # [s] that it stands at the end of its travel, at least; chosen
+NEAR_END = 0.005  # share of a joint's travel within which its end is; chosen
+PUSH = 2.0  # times its dry friction, beyond which a torque moves a joint unless a stop holds it; chosen
+LEAST_PUSH = 0.1  # of its largest torque, which such a torque is at least; chosen
 CAUSES = "the sign of a torque or angle column, a unit, or a radius in the machine file"
 
 
@@ -51,8 +56,9 @@ def assess(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter
     """
     possible, clear = _signs_hold(model, estimate)
     together = ""
+    stop = "; ".join(_stops(model, logs, estimate, filter))
     definite = _is_positive_definite(model, logs, estimate, filter)
-    notes = [_note(estimate, int(k)) for k in np.flatnonzero(~possible)]
+    notes = [_note(estimate, int(k), bool(stop)) for k in np.flatnonzero(~possible)]
     if not definite:
         moved = np.isin(estimate.names, [n for n in model.base.names if n[0] in INERTIAL_INITIALS])
         consistent = _nearest(model, estimate)
@@ -76,12 +82,55 @@ def assess(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter
         or "; ".join(dict.fromkeys(d for one in logs for d in one.doubts))
         or _unit_suspicion(model, estimate)
     )
-    doubt = "; ".join(text for text in (first, describe_failures(estimate.tests)) if text)
+    doubt = "; ".join(text for text in (stop, first, describe_failures(estimate.tests)) if text)
     if clear and not doubt:
         doubt = f"values that no machine has: check {CAUSES}"
     status = "invalid" if clear else "doubtful" if doubt else "valid"
     estimate = replace(estimate, doubt=doubt, status=status, possible=possible, prior_std=model.known.std)
     return add_notes(estimate, *notes)
+
+
+def _stops(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter) -> list[str]:
+    """Say of each joint that stands at the end of its travel under more torque than its friction and load take.
+
+    By the machine file's values and by the estimate: either may be wrong, one by the machine, one by the stop.
+    """
+    if not model.fully_driven or not model.plain:
+        return []
+    found = []
+    for log in logs:
+        s = samples(model, log, filter)
+        for body in model.machine.actuated:
+            k = model.coordinates.index(model.machine.coordinate(body))
+            x, v = s.q[k], np.abs(s.nu[k])
+            friction = float(body.friction.Fs) if body.friction is not None else 0.0
+            enough = max(PUSH * friction, LEAST_PUSH * float(np.abs(s.Y[k]).max()))
+            for end, outward in ((x.max(), 1.0), (x.min(), -1.0)):
+                stands = np.flatnonzero((np.abs(x - end) < NEAR_END * np.ptp(x)) & (v < STANDS * v.max()))
+                if len(stands) * float(np.diff(log.t).min()) < STANDS_S:
+                    continue
+                q = s.q[:, stands]
+                W = model.stacked_regressor(q, 0 * q, 0 * q)[:, k]
+                push = np.zeros(len(x))
+                push[stands] = np.min(
+                    [outward * (s.Y[k, stands] - W @ X) for X in (model.nominal, estimate.value_or(model.nominal))],
+                    axis=0,
+                )
+                held = push > enough
+                edges = np.flatnonzero(np.diff(np.concatenate([[0], held, [0]])))
+                runs = [
+                    r for r in zip(edges[::2], edges[1::2] - 1, strict=True) if log.t[r[1]] - log.t[r[0]] > STANDS_S
+                ]
+                if runs:
+                    a, b = runs[0]
+                    unit, force = ("rad", "N m") if body.joint == "revolute" else ("m", "N")
+                    found.append(
+                        f"{body.where} stands at {format_number(end, 3)} {unit}, where its travel ends, from"
+                        f" {log.t[a]:.2f} to {log.t[b]:.2f} s, under {format_number(push[a : b + 1].mean(), 2)}"
+                        f" {force} more than its load takes: did it run into a stop? the model has none; leave these"
+                        " rows out"
+                    )
+    return found
 
 
 def _contradiction(model: Model, estimate: Estimate) -> str:
@@ -195,10 +244,12 @@ def _nearest(model: Model, estimate: Estimate) -> np.ndarray | None:
         return None
 
 
-def _note(estimate: Estimate, k: int) -> str:
-    """Say of an impossible value what usually causes it."""
+def _note(estimate: Estimate, k: int, stopped: bool = False) -> str:
+    """Say of an impossible value what usually causes it. stopped: a joint ran into a stop."""
     value, std, unit = estimate.value[k], estimate.std[k], estimate.units[k]
     text = f"{estimate.names[k]} = {format_number(value, 4)} {unit}: no machine has such a value"
+    if stopped:
+        return f"{text}; the stop that a joint ran into may cause it"
     if abs(value) > CLEAR_STDS * std:
         return f"{text}; usual causes are {CAUSES}"
     return (

@@ -29,6 +29,7 @@ from .plausibility import doubts_in_errors as doubts_in_errors
 from .preparation import Prepared as Prepared, prepare as prepare, read_stretches as read_stretches
 from .profile import (
     PlannedDrive as PlannedDrive,
+    drive_file as drive_file,
     is_profile as is_profile,
     motion_columns as motion_columns,
     profile_of as profile_of,

@@ -51,6 +51,7 @@ MANY = 0.005  # share of a channel's samples that may be repaired; chosen
 FEW = 20  # readings that do not say how fast a channel is; chosen
 SLOWER = 1.5  # times the step of the fastest channel, from which one is slower; chosen
 CUTOFFS = 10.0  # times the filter's cutoff at which a channel follows what the filter passes; chosen
+SLOWED = 0.5  # of its highest speeds (90 % below), at which a position that comes to rest moves before; chosen
 ROUNDED_FINE = 2.0  # times the machine file's noise that rounding may add; chosen
 DECIMATION_PASS = 0.4  # of the rate after decimation, up to which its filter passes
 COARSE_SHARE = 0.02  # of an acceleration's mean square that may be due to rounding; chosen
@@ -446,7 +447,7 @@ def ends_of_range(record: Record) -> Iterator[Finding]:
         for end, word in ((c.x.max(), "highest"), (c.x.min(), "lowest")):
             edges = np.flatnonzero(np.diff(np.concatenate([[0], c.x == end, [0]])))
             runs = [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= STUCK]
-            runs = [r for r in runs if r not in frozen and _moved(record, c, *r)]
+            runs = [r for r in runs if r not in frozen and _moved(record, c, *r) and not _comes_to_rest(c, *r)]
             if runs:
                 rows = max(b - a + 1 for a, b in runs)
                 spans = tuple((float(c.t[a]), float(c.t[b])) for a, b in runs)
@@ -554,6 +555,15 @@ def dropouts_of(c: Channel, record: Record) -> tuple[tuple[int, int], ...]:
     if _counts_on(c.sensor):
         return found
     return tuple((a, b) for a, b in found if _moved(record, c, a, b))
+
+
+def _comes_to_rest(c: Channel, first: int, last: int) -> bool:
+    """Tell a position that slows down into a stretch of equal readings, and leaves it slowly, from one that is cut."""
+    if not _counts_on(c.sensor):
+        return False
+    steps = np.abs(np.diff(c.x))
+    beside = np.concatenate([steps[max(first - 2, 0) : first], steps[last : last + 2]])
+    return bool(beside.max(initial=0.0) < SLOWED * np.quantile(steps[steps > 0], 0.9))
 
 
 def _moved(record: Record, c: Channel, first: int, last: int) -> bool:

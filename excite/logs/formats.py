@@ -40,6 +40,7 @@ FORMATS = (
     Format("a TDMS file", (".tdms",), "tdms.read_tdms", "`group/channel`", "tdms"),
     Format("a ULog file", (".ulg",), "ulog.read_ulog", "`topic/field`, `topic.1/field` of a second sensor", "ulog"),
 )
+PROFILE = "profile.csv"  # the drive in the folder of a design
 BAG_FOLDER = "metadata.yaml"  # what the folder of a bag of ROS 2 holds
 SUFFIXES = tuple(suffix for form in FORMATS for suffix in form.suffixes)
 ENDINGS = ", ".join(SUFFIXES)

@@ -35,6 +35,7 @@ SEVERAL = 50  # steps that counts are judged by
 STILL = 1e-6  # of a count: no step
 STEP_ROUNDING = 1e-9  # of the largest reading: smaller steps are rounding of the numbers; chosen
 OFF, MOSTLY = 0.1, 0.9  # of a count, and share of the steps, by which steps are whole ones
+VARYING = 0.05  # share of the steps that differ from the one before, of rounded readings; chosen
 ONE = 0.03  # by which the smallest step may differ from one count, as numbers in a file are rounded
 SHARE = 0.1  # of the highest speed: below, dry friction fades
 SLOW = 0.1  # rad/s: below, friction fades in an average over a span
@@ -394,13 +395,13 @@ def _pulls(
 def _counts(sensor: Sensor, machine: Machine, values: np.ndarray) -> str:
     """An angle that moves in other steps than those of its counts, "" where it doesn't."""
     assert sensor.resolution is not None
-    steps = np.abs(np.diff(values)) / sensor.resolution
-    steps = steps[steps > STILL]
+    every = np.abs(np.diff(values)) / sensor.resolution
+    steps = every[every > STILL]
     if len(steps) < SEVERAL:
         return ""
     off = OFF + float(np.finfo(np.float32).eps * np.abs(values).max() / sensor.resolution)
     least, turn = float(np.quantile(steps, 0.01)), float(sensor.counts_per_turn or 0)
-    if _whole(steps / least, off * min(1, 1 / least)) and abs(least - 1) > ONE:
+    if _whole(steps / least, off * min(1, 1 / least)) and abs(least - 1) > ONE and _vary(every / least):
         return (
             f"column {sensor.column}: moves in steps of {format_number(least, 3)} counts of {turn:g} per turn: is it"
             f" filtered or rounded, or is it counts_per_turn = {round(turn / least)}? then write that for it in"
@@ -416,12 +417,18 @@ def _counts(sensor: Sensor, machine: Machine, values: np.ndarray) -> str:
 
 def step_of(values: np.ndarray) -> float:
     """Return the step [SI] in whole numbers of which readings (N,) move, 0 if there is none."""
-    steps = np.abs(np.diff(values))
-    steps = steps[steps > STEP_ROUNDING * float(np.abs(values).max(initial=0.0))]
+    every = np.abs(np.diff(values))
+    steps = every[every > STEP_ROUNDING * float(np.abs(values).max(initial=0.0))]
     if len(steps) < SEVERAL:
         return 0.0
     least = float(np.quantile(steps, 0.01))
-    return least if _whole(steps / least, OFF) else 0.0
+    return least if _whole(steps / least, OFF) and _vary(every / least) else 0.0
+
+
+def _vary(steps: np.ndarray) -> bool:
+    """Tell rounded readings from those at a constant speed by their steps (N,) [counts]: rounded ones differ."""
+    counts = np.round(steps)
+    return bool(np.count_nonzero(np.diff(counts)) >= VARYING * np.count_nonzero(counts))
 
 
 def _whole(steps: np.ndarray, off: float) -> bool:

@@ -11,6 +11,7 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs import tables
+from excite.logs.formats import PROFILE
 from excite.logs.log import OFF_RATE, check_time, columns_of, numbers
 from excite.model import Model
 from excite.simulation import Motion
@@ -74,6 +75,20 @@ class PlannedDrive:
         return self.q0 if self.placed else None
 
 
+def drive_file(path: str | Path) -> Path:
+    """Return the file of a drive: of a design's folder its profile, else the path as it is.
+
+    Raises LogError for a folder that holds several drives.
+    """
+    path = Path(path)
+    if (path / PROFILE).is_file():
+        return path / PROFILE
+    inside = sorted(p.parent for p in path.glob(f"*/{PROFILE}")) if path.is_dir() else []
+    if inside:
+        raise LogError(f"{path}: has no {PROFILE}, but folders with one: give one of them, such as {inside[0]}")
+    return path
+
+
 def is_profile(source: str | Path | pd.DataFrame, model: Model) -> bool:
     """Tell a profile from a log by its columns: all speeds of the expected motion, or torques without angles.
 
@@ -82,7 +97,7 @@ def is_profile(source: str | Path | pd.DataFrame, model: Model) -> bool:
     machine = model.machine
     angles = {c for s in machine.sensors("full") if s.kind in ("angle", "wheel") for c in s.columns}
     wanted = [machine.time_column, *(c for s in machine.sensors("full") for c in s.columns)]
-    table = source if isinstance(source, pd.DataFrame) else tables.read_table(source, wanted)
+    table = source if isinstance(source, pd.DataFrame) else tables.read_table(drive_file(source), wanted)
     have = set(tables.with_names(table, wanted).columns)
     torques = {torque_column(model, n) for n in model.inputs}
     return {rate for _, rate in motion_columns(model)} <= have or (torques <= have and not angles & have)
@@ -100,10 +115,11 @@ def read_profile(path: str | Path, model: Model) -> tuple[np.ndarray, np.ndarray
 def read_drive(source: str | Path | pd.DataFrame, model: Model, any_rate: bool = False) -> PlannedDrive:
     """Read a profile with the motion that is expected; its first state is zero where it gives none.
 
+    source: a file, the folder of a design, or its table.
     any_rate: take rows at another rate than the machine's as knots, between which every column is linear.
     Raises LogError as for a log.
     """
-    table = source if isinstance(source, pd.DataFrame) else tables.read_table(source)
+    table = source if isinstance(source, pd.DataFrame) else tables.read_table(drive_file(source))
     source = str(table.attrs.get("source", "profile")) if isinstance(source, pd.DataFrame) else str(source)
     needed = ["t_s", *(torque_column(model, n) for n in model.inputs)]
     missing = [c for c in needed if c not in table.columns]

@@ -12,7 +12,7 @@ from excite.logs.files import reader_of
 from excite.logs.files.canbus import is_candump
 from excite.logs.files.common import NOTES, OTHER_NAMES, TIMESTAMPS, UNCLEAR as UNCLEAR, UNITS_SAID, UNITS_UNKNOWN
 from excite.logs.files.text import COMMENTS as COMMENTS
-from excite.logs.formats import BAG_FOLDER, ENDINGS
+from excite.logs.formats import BAG_FOLDER, ENDINGS, PROFILE
 
 MDF_TIME = TIMESTAMPS
 
@@ -27,6 +27,11 @@ def read_table(path: str | Path, wanted: Iterable[str] = ()) -> pd.DataFrame:
     """
     path = Path(path)
     folder = path.is_dir() and (path / BAG_FOLDER).is_file()
+    if (path / PROFILE).is_file() and not folder:
+        raise LogError(
+            f"{path}: is the folder of a drive, no log: give what the machine's sensors wrote along it; `excite"
+            " simulate` writes what they may write"
+        )
     if not path.is_file() and not folder:
         raise LogError(f"{path}: no such file" if not path.is_dir() else f"{path}: is a folder, give a file")
     if not folder and path.stat().st_size == 0:

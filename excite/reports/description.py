@@ -83,17 +83,23 @@ def describe_outside_law(share: float | None) -> tuple[str, ...]:
     )
 
 
-def describe_violations(violations: Mapping[str, float], tolerance: float = TOLERANCE) -> str:
-    """Name the limits that are exceeded by more than the tolerance, the worst first, "" if there is none."""
+def describe_violations(
+    violations: Mapping[str, float], said: Mapping[str, str] | None = None, tolerance: float = TOLERANCE
+) -> str:
+    """Name the limits that are exceeded by more than the tolerance, the worst first, "" if there is none.
+
+    said: what is said of a limit instead of a share of its range, as from `trajectories.excesses_in_units`.
+    """
+    said = said or {}
     over = sorted(((v, n) for n, v in violations.items() if v > tolerance), reverse=True)
-    shown = ", ".join(f"{n} by {format_percent(100 * v)}" for v, n in over[:MAX_NAMES])
-    rest = f" and {len(over) - MAX_NAMES} more" if len(over) > MAX_NAMES else ""
-    return f"{shown}{rest} of the range" if over else ""
+    lines = [said[n] for _, n in over if n in said][:MAX_NAMES]
+    shares = [f"{n} by {format_percent(100 * v)}" for v, n in over if n not in said]
+    return "; ".join([*lines, *([f"{join_some(shares)} of the range"] if shares else [])])
 
 
 def describe_drive_faults(s: Summary) -> tuple[str, ...]:
     """Return a line on the limits that a simulated drive breaks, and one on its samples outside the soil law."""
-    over = describe_violations(s["violations"])
+    over = describe_violations(s["violations"], s.get("excesses"))
     return (*((f"limits broken: {over}",) if over else ()), *describe_outside_law(s["share_outside_law"]))
 
 

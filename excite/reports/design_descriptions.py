@@ -33,9 +33,8 @@ def describe_design(s: Summary) -> Description:
     sigma = s["sigma_percent"]
     worst = max(sigma, key=lambda n: sigma[n])
     kept = s["max_violation"] <= TOLERANCE
-    limits = (
-        "every limit is kept" if kept else f"limits are exceeded by {100 * s['max_violation']:.2f} % of their range"
-    )
+    over = describe_violations(s.get("violations", {}), s.get("excesses")) or format_percent(100 * s["max_violation"])
+    limits = "every limit is kept" if kept else f"limits broken: {over}"
     driven = "Driven by a steady person" if s.get("driver") else "Driven as designed"
     headline = (
         f"{driven}, these {s['duration_s']:g} s identify every parameter to {format_percent(sigma[worst])} or better"
@@ -228,7 +227,7 @@ def _describe_kept_limits(s: Summary) -> str:
         return kept
     if any(x is None or not math.isfinite(x) for x in followed.values()):
         return f"{kept} In simulation a position controller cannot follow the motion."
-    if over := describe_violations(followed, SHOWN_VIOLATION):
+    if over := describe_violations(followed, tolerance=SHOWN_VIOLATION):
         return f"{kept} As a position controller follows the motion, it exceeds {over}."
     return f"{kept} They are kept where a position controller follows the motion as well." if kept else ""
 
@@ -252,7 +251,8 @@ def describe_score(s: Summary) -> Description:
         most = format_percent(100 * MAX_IDENTIFIABLE_STD)
         few = f"{len(hidden)} of {count(len(sigma), 'parameter')} ({join_some(hidden)})"
         shown = f"do not show {few}, whose error stays above {most}"
-    over = describe_violations(s["violations"])
+    over = describe_violations(s["violations"], s.get("excesses"))
+    lasts = trajectories.DURATION_LIMIT in s.get("excesses", {})
     limits = f"limits broken: {over}" if over else "every limit is kept"
     worst = f"worst {s['worst_parameter']}"
     if hidden:
@@ -265,6 +265,7 @@ def describe_score(s: Summary) -> Description:
         f"Condition number of Phi {_condition(s['cond_phi'])}, of W {_condition(s['cond_w'])}.",
         *_describe_given_zeros(s),
         *describe_outside_law(s["share_outside_law"]),
+        *((f"`--duration {s['duration_s']:g}` judges it as a drive of its own length.",) if lasts else ()),
     )
     tables = (*_sensors_table(s), _sigma_table(s), *_violations_table(s))
     return Description(f"Score of {s['profile']} on {s['machine']}, problem {s['problem']}", headline, tables, remarks)
@@ -305,8 +306,13 @@ def _sigma_table(s: Summary) -> Table:
 
 def _violations_table(s: Summary) -> tuple[Table, ...]:
     """Return the table of the limits that are exceeded, none if every limit is kept."""
-    over = tuple((name, f"{100 * value:.3f}") for name, value in s["violations"].items() if value >= SHOWN_VIOLATION)
-    return (Table("Limits that are exceeded, in per cent of their range.", ("limit", "%"), over),) if over else ()
+    said = s.get("excesses", {})
+    over = tuple(
+        (name, said.get(name) or f"{100 * value:.3f} % of its range")
+        for name, value in s["violations"].items()
+        if value >= SHOWN_VIOLATION
+    )
+    return (Table("Limits that are exceeded.", ("limit", "by"), over),) if over else ()
 
 
 WAYS_OF_DRIVING = {
@@ -429,4 +435,6 @@ def _equal_score(d: Mapping[str, Any]) -> str:
 
 
 def _broken_limit(d: Mapping[str, Any]) -> str:
-    return "-" if d["breaks"] is None else f"{d['breaks']} by {format_percent(100 * d['max_violation'])}"
+    if d["breaks"] is None:
+        return "-"
+    return d.get("excess") or f"{d['breaks']} by {format_percent(100 * d['max_violation'])}"

@@ -153,7 +153,7 @@ def describe_identify(s: Summary) -> Description:
         )
     remarks = [
         *wrong,
-        *(f"{name} can't be identified: {reason}." for name, reason in s["reasons"].items()),
+        *_describe_reasons(s["reasons"]),
         *dict.fromkeys(s["notes"]),
         *describe_outside_law(s.get("share_outside_law")),
     ]
@@ -201,6 +201,14 @@ def describe_identify(s: Summary) -> Description:
     if "torque_constant" in s and s["status"] != "invalid":
         remarks = [_describe_constant(s["torque_constant"]), *remarks]
     return Description(f"Parameters of {s['machine']}", headline, tables, tuple(remarks), s["status"], verdict)
+
+
+def _describe_reasons(reasons: Mapping[str, str]) -> list[str]:
+    """Say why parameters can't be identified, a remark for all of one reason."""
+    together: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        together.setdefault(reason, []).append(name)
+    return [f"{', '.join(names)} can't be identified: {reason}." for reason, names in together.items()]
 
 
 def _describe_constant(c: Mapping[str, Any]) -> str:

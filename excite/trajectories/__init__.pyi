@@ -44,6 +44,8 @@ from .limits import (
     TOLERANCE as TOLERANCE,
     Limit as Limit,
     check_limits as check_limits,
+    describe_excess as describe_excess,
+    excesses_in_units as excesses_in_units,
     is_lane_limit as is_lane_limit,
     is_rest_limit as is_rest_limit,
     keeps_motion_limits as keeps_motion_limits,

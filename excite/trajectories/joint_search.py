@@ -33,7 +33,15 @@ from excite.trajectories.joint_motion import (
     violations_as_followed,
     with_smooth_friction,
 )
-from excite.trajectories.limits import TOLERANCE, chosen_poses, end_poses, machine_limits, stack_limits
+from excite.trajectories.limits import (
+    LIGHTEN,
+    TOLERANCE,
+    chosen_poses,
+    describe_overload,
+    end_poses,
+    machine_limits,
+    stack_limits,
+)
 from excite.trajectories.multistart import (
     Design,
     Report,
@@ -174,7 +182,7 @@ def design_joint_motion(
     complete = len(states) == starts and all(t.complete for t in states.values())
     if best.best.excess > TOLERANCE:
         if interrupted:
-            raise KeyboardInterrupt(no_drive_yet(best.best.violations))
+            raise KeyboardInterrupt(no_drive_yet(model, best.best.violations))
         raise infeasible_error(model, composite, best.best.violations, complete)
     chosen = keep_as_followed(model, problem, composite, best.best)
     states[best.number] = replace(best, best=chosen)
@@ -237,7 +245,7 @@ def _run_start(
     state = None
     for k, found in enumerate(search(model, problem, objective, trajectory, seed, should_stop)):
         state = replace(found, number=number)
-        write_stage(stop, number, k, _reported(objective, state.best), state.best.violations)
+        write_stage(model, stop, number, k, _reported(objective, state.best), state.best.violations)
     return state
 
 
@@ -365,7 +373,7 @@ def free_poses(model: Model, problem: Problem) -> np.ndarray:
     Raises MachineError if none does.
     """
     start, end = end_poses(model, problem)
-    chosen = list(chosen_poses(model, problem)) if problem.rest else []
+    chosen = list(chosen_poses(model, problem))
     low, high = drive_ranges(model)
     drawn = (low + high) / 2 + (random_poses(model, START_POSES) - (low + high) / 2) * START_REACH
     tried = np.tile(start, (len(drawn) if chosen else 1, 1))
@@ -381,12 +389,18 @@ def free_poses(model: Model, problem: Problem) -> np.ndarray:
     if (kept.all() if not chosen else kept.any()) or not limits:
         return tried[kept[: len(tried)]]
     often = limits[int(np.argmax(over.mean(axis=1)))]
-    where = (
-        f"none of {len(tried)} random start poses keeps every limit"
-        if chosen
-        else "the start or end pose exceeds a limit"
-    )
-    raise MachineError(
-        f"{model.machine.name}: {where} at rest, first of all {often.name}: give the problem another"
-        " start_pose, or change shapes, floor or limits in the machine file"
-    )
+    name = model.machine.name
+    if chosen:
+        share = np.where(over, np.maximum(values - high_g, low_g - values), 0) / [[g.range] for g in limits]
+        nearest = every[[int(np.argmin(share.max(axis=0)))]]
+        where = f"none of {len(tried)} random poses keeps every limit at rest"
+        change = "give the problem a start_pose that does, or change shapes, floor or limits in the machine file"
+    else:
+        nearest = every
+        where = "the start or end pose exceeds a limit at rest"
+        change = "give the problem another start_pose, or change shapes, floor or limits in the machine file"
+    if often.kind == "torque" and (overload := describe_overload(model, nearest)):
+        best = "even in the best of them " if chosen else ""
+        other = "" if chosen else "give the problem poses that it can hold, or "
+        raise MachineError(f"{name}: {where}: {best}{overload}; {other}{LIGHTEN}")
+    raise MachineError(f"{name}: {where}, first of all {often.name}: {change}")

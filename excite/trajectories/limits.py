@@ -15,7 +15,7 @@ import scipy
 
 from excite.model import Model
 from excite.model.machine import Problem
-from excite.simulation import Motion, simulate
+from excite.simulation import Motion, motion_along, simulate
 from excite.text import format_number
 from excite.trajectories.clearance import clearance_limits, drive_ranges, tool_point
 
@@ -31,6 +31,7 @@ TOP_SPEED_FACTOR = 1.2  # top speed over rim speed, with slip; chosen
 DEFAULT_TOP_SPEED = 10.0  # m/s, without a limit on rim speed; chosen
 SLIP_ROUNDING = 0.05  # of the slip limit: what it shows without slip, as a share of the limit; chosen
 POWER_SMOOTHING = 1e-3  # of the power limit: rounding of |u q'|; chosen
+LIGHTEN = "raise torque under [body.limit], or check masses, centres of mass and gravity in the machine file"
 TOOL_ROUNDING = 0.05  # of the limit on the tool's speed: what it shows at rest, as a share of the limit
 
 
@@ -338,7 +339,7 @@ def resting_coordinates(model: Model) -> tuple[int, ...]:
 def end_poses(model: Model, problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Return the coordinates (n_q,) at the start and at the end, as `Problem` says."""
     low, high = drive_ranges(model)
-    start = np.where((low <= 0) & (high >= 0), 0.0, (low + high) / 2)
+    start = np.where((low < 0) & (high > 0), 0.0, (low + high) / 2)
     for c, place in problem.start_pose.items():
         start[model.coordinates.index(c)] = place
     end = start.copy()
@@ -400,15 +401,60 @@ def _rest(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
     return still | {f"rest {model.coordinates[k]}": max(0.0, float(away[k])) for k in given}
 
 
-def describe_excess(model: Model, name: str, excess: float) -> str:
-    """Say by how much a drive exceeds a limit; of rest at the ends, how fast it moves or how far it is off."""
+def describe_excess(model: Model, name: str, excess: float, end: str = "the end") -> str:
+    """Say by how much a drive exceeds a limit; of rest, how fast it moves at an end or how far it is off its pose."""
     for k, c in enumerate(model.coordinates):
         unit = "rad" if c.startswith("theta") else "m"
         if name == f"rest {c}'":
-            return f"{c} still moves at {format_number((1 + excess) * rest_tolerances(model)[k], 3)} {unit}/s at an end"
+            speed = format_number((1 + excess) * rest_tolerances(model)[k], 3)
+            return f"{c} {'still moves' if end == 'the end' else 'moves'} at {speed} {unit}/s at {end}"
         if name == f"rest {c}":
-            return f"{c} is {format_number((1 + excess) * REST_POSITION, 3)} {unit} off its pose at an end"
+            return f"{c} is {format_number((1 + excess) * REST_POSITION, 3)} {unit} off its pose at {end}"
     return f"{name} is exceeded by {100 * excess:.2f} % of its range"
+
+
+def excesses_in_units(
+    model: Model, problem: Problem, motion: Motion, violations: Mapping[str, float]
+) -> dict[str, str]:
+    """Say in units what a share of a range does not: rest at the ends, the duration; by limit, those not kept."""
+    found = {}
+    for name, excess in violations.items():
+        if excess > TOLERANCE and is_rest_limit(name):
+            k = model.coordinates.index(name.removeprefix("rest ").removesuffix("'"))
+            moving = name.endswith("'")
+            off = np.abs(motion.nu[[0, -1]] if moving else motion.q[[0, -1]] - end_poses(model, problem))[:, k]
+            found[name] = describe_excess(model, name, excess, "the start" if off[0] > off[1] else "the end")
+        elif excess > TOLERANCE and name == DURATION_LIMIT:
+            lasts, wanted = float(motion.t[-1] - motion.t[0]), float(problem.duration_s)
+            found[name] = f"it lasts {lasts:g} s, and the problem asks for {wanted:g} s"
+    return found
+
+
+def describe_overload(model: Model, poses: np.ndarray) -> str:
+    """Say which joint's load at rest exceeds its torque limit most, and in which of some poses (k, n_q).
+
+    Returns "" where every drive holds every pose, and for a machine that is not fully driven.
+    """
+    if not model.fully_driven:
+        return ""
+    still = np.zeros_like(poses)
+    load = np.abs(motion_along(model, np.arange(float(len(poses))), poses, still, still).u)
+    bodies = model.machine.actuated
+    limit = np.array([np.inf if b.limit.torque is None else float(b.limit.torque) for b in bodies])
+    at, k = np.unravel_index(int(np.argmax(load / limit)), load.shape)
+    if load[at, k] <= limit[k]:
+        return ""
+    pose = ", ".join(
+        f"{c} {x:.3g} {'rad' if c.startswith('theta') else 'm'}"
+        for c, x in zip(model.coordinates, poses[at], strict=True)
+    )
+    unit = "N m" if bodies[k].joint == "revolute" else "N"
+    loaded = "gravity and springs load" if any(b.spring is not None for b in model.machine.body) else "gravity loads"
+    return (
+        f"{loaded} {bodies[k].where} with {format_number(load[at, k], 3)} {unit}"
+        f" {f'at {pose}' if model.active_coordinates else 'in every pose'}, more than its torque limit of"
+        f" {limit[k]:g} {unit}"
+    )
 
 
 def _reversals(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:

@@ -21,12 +21,13 @@ from typing import Any, Self
 import joblib
 import numpy as np
 
-from excite.errors import InfeasibleError, SolverError
+from excite.errors import InfeasibleError, MachineError, SolverError
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion, simulate
-from excite.text import format_number, format_percent
+from excite.text import format_percent
 from excite.trajectories import composite_objective, objective as objectives
+from excite.trajectories.clearance import random_poses
 from excite.trajectories.composite_objective import SIGMA_MAX, CompositeObjective
 from excite.trajectories.continuation import (
     SCREENING_STAGES,
@@ -43,7 +44,14 @@ from excite.trajectories.continuation import (
     start_from_multisine,
 )
 from excite.trajectories.excitation import Manoeuvre
-from excite.trajectories.limits import describe_excess, move_motion, place_along_lane
+from excite.trajectories.limits import (
+    LIGHTEN,
+    describe_excess,
+    describe_overload,
+    end_poses,
+    move_motion,
+    place_along_lane,
+)
 
 
 class BestSoFar(float):
@@ -58,6 +66,7 @@ class BestSoFar(float):
 
 
 Report = Callable[[int, int, BestSoFar], None]
+OVERLOAD_POSES = 1000  # random poses in which gravity is looked at where a drive exceeds a torque limit
 MIN_LATER_STEPS = len(STAGES) - SCREENING_STAGES + 1  # progress reports of a selected start, at least
 
 
@@ -115,13 +124,16 @@ def design(
     The same seed gives the same design unless the search is cut short.
 
     Raises InfeasibleError with the limit and its excess, SolverError if the solver ended without an optimum from every
-    start, KeyError for an unknown objective or solver.
+    start, KeyError for an unknown objective or solver, MachineError for a machine whose drives do not hold its weight.
     """
     if solver not in SOLVERS:
         raise KeyError(f"no solver {solver}, allowed: {', '.join(SOLVERS)}")
     composite = composite_objective.compose_objective(model, objective) if isinstance(objective, str) else objective
     if starts < (0 if warm else 1):
         raise ValueError(f"starts must be at least 1, got {starts}")
+    overload = "" if model.follows_positions else describe_overload(model, np.array(end_poses(model, problem)))
+    if overload:
+        raise MachineError(f"{model.machine.name}: no drive can hold it: {overload}; {LIGHTEN}")
     now = time.time()
     half, deadline = (None, None) if budget_s is None else (now + budget_s / 2, now + budget_s)
     seeds = np.random.SeedSequence(seed).generate_state(starts)
@@ -153,9 +165,9 @@ def design(
     best = min(states.values(), key=lambda t: (t.failure is not None, *rank(t.best), t.number))
     complete = len(states) == len(guesses) and all(states[t.number].complete for t in chosen)
     if not best.best.feasible and interrupted:
-        raise KeyboardInterrupt(no_drive_yet(best.best.violations))
+        raise KeyboardInterrupt(no_drive_yet(model, best.best.violations))
     if best.failure is not None:
-        raise _no_optimum(solver, best, len(guesses))
+        raise _no_optimum(model, solver, best, len(guesses))
     if not best.best.feasible:
         raise infeasible_error(model, composite, best.best.violations, complete)
     drive = best.best
@@ -199,25 +211,21 @@ def _screening_order(state: SearchState) -> tuple[bool, float, int]:
     return state.failure is not None, selection_score(state.latest), state.number
 
 
-def _no_optimum(solver: str, best: SearchState, starts: int) -> SolverError:
+def _no_optimum(model: Model, solver: str, best: SearchState, starts: int) -> SolverError:
     """Build the error of a solver that ended without an optimum from every start."""
     name = max(best.latest.violations, key=lambda limit: best.latest.violations[limit])
     excess = best.latest.excess
-    where = (
-        f", where {name} is exceeded by {format_number(100 * excess, 2)} % of its range"
-        if not best.latest.feasible
-        else ""
-    )
+    where = f", where {describe_excess(model, name, excess)}" if not best.latest.feasible else ""
     return SolverError(
         f"{solver} found no optimum from any of the starts ({starts}), the best ended with {best.failure}{where};"
         " give more starts or another seed, or take the other solver"
     )
 
 
-def no_drive_yet(violations: Mapping[str, float]) -> str:
+def no_drive_yet(model: Model, violations: Mapping[str, float]) -> str:
     """Say why there is no drive yet: the limit that is exceeded most, and by how much."""
     name = max(violations, key=lambda limit: violations[limit])
-    return f"no drive within all limits yet: {name.replace('_', ' ')} {format_percent(100 * violations[name], 2)} over"
+    return f"no drive within all limits yet: {describe_excess(model, name, violations[name])}"
 
 
 def infeasible_error(
@@ -233,6 +241,14 @@ def infeasible_error(
             f" {format_percent(100 * excess)}, the worst parameter comes out at"
             f" {format_percent(objective.sigma_max * (1 + excess), 3)} in the best attempt;"
             f" {'allow more, or give a longer duration or more starts' if complete else cut}",
+            name,
+            excess,
+        )
+    overload = describe_overload(model, random_poses(model, OVERLOAD_POSES)) if name.startswith("torque u") else ""
+    if overload:
+        return InfeasibleError(
+            f"no drive found that keeps every limit: {describe_excess(model, name, excess)} in the best attempt:"
+            f" {overload}; narrow position_low and position_high to poses that it can hold, or {LIGHTEN}",
             name,
             excess,
         )
@@ -306,12 +322,14 @@ def begin_worker(stop: Path, deadline: float | None) -> Callable[[], bool]:
     return lambda: stop.exists() or (deadline is not None and time.time() > deadline)
 
 
-def write_stage(stop: Path, number: int, stage: int, score: float, violations: Mapping[str, float]) -> None:
+def write_stage(
+    model: Model, stop: Path, number: int, stage: int, score: float, violations: Mapping[str, float]
+) -> None:
     """Write the best score of a start after a stage beside the stop file, for `progress_reports`.
 
     violations: of the drive that has this score.
     """
-    excess, over = max(violations.values(), default=0.0), no_drive_yet(violations) if violations else ""
+    excess, over = max(violations.values(), default=0.0), no_drive_yet(model, violations) if violations else ""
     fresh = stop.parent / f".{number}"
     fresh.write_text(f"{score!r}\n{excess!r}\n{over}", encoding="utf-8")
     fresh.replace(stop.parent / f"{number}-{stage}")
@@ -336,7 +354,7 @@ def _run_start(
     stages = itertools.count(0 if state is None else SCREENING_STAGES)
 
     def report_stage(state: SearchState) -> None:
-        write_stage(stop, number, next(stages), _score(objective, state.best), state.best.violations)
+        write_stage(model, stop, number, next(stages), _score(objective, state.best), state.best.violations)
 
     if state is None:
         if number > 0 and should_stop():

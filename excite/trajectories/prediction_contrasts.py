@@ -28,7 +28,7 @@ def prediction_contrasts(model: Model, motion: Motion) -> np.ndarray:
         signals = motion.nu.T
     else:
         W = model.stacked_regressor(motion.q.T, motion.nu.T, motion.a.T, *effect_inputs(model, motion))
-        change = W[list(model.actuated)] * np.where(_acts(model), by, 0.0)
+        change = W[:, list(model.actuated)].swapaxes(0, 1) * np.where(_acts(model), by, 0.0)
         signals = motion.u.T
     size = np.sqrt(np.mean(signals**2, axis=1))
     kept = size > 1e-6 * size.max()

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from excite import logs, output
-from excite.errors import DesignFolderError
+from excite.errors import DesignFolderError, LogError
 from excite.model import Model, build
 from excite.model.machine import Machine, Problem
 from excite.simulation import Motion, play_back
@@ -36,6 +36,15 @@ def read_design_summary(design_dir: Path) -> dict[str, Any]:
     Raises DesignFolderError.
     """
     path = design_dir / output.SUMMARY
+    if design_dir.is_file():
+        raise DesignFolderError(
+            f"{design_dir}: not a design, whose folder is needed; `excite score MACHINE {design_dir.name}` makes one of"
+            " any drive"
+        )
+    try:
+        logs.drive_file(design_dir)
+    except LogError as err:
+        raise DesignFolderError(str(err)) from None
     if not path.is_file():
         raise DesignFolderError(
             f"{design_dir}: not a design (no {output.SUMMARY} in it), make one with `excite design MACHINE`"

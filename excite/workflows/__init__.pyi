@@ -18,6 +18,7 @@ from .design_workflow import (
     compare_account as compare_account,
     design as design,
     design_account as design_account,
+    is_own_drive as is_own_drive,
     prepare_design as prepare_design,
     read_rivals as read_rivals,
 )
@@ -52,7 +53,12 @@ from .requests import (
     require_objective as require_objective,
     require_positive as require_positive,
 )
-from .score_workflow import judge_limits as judge_limits, score as score, score_account as score_account
+from .score_workflow import (
+    excesses as excesses,
+    judge_limits as judge_limits,
+    score as score,
+    score_account as score_account,
+)
 from .simulate_workflow import doubtful_effects as doubtful_effects, with_effects as with_effects
 from .slip_workflow import slip as slip, slip_account as slip_account
 from .study_plan import Study as Study, read_study as read_study

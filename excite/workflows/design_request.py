@@ -157,8 +157,7 @@ def contrasts(model: Model, request: DesignRequest) -> np.ndarray | None:
         return trajectories.rival_contrasts(model, [e.name for e in model.effects[-len(request.between) :]])
     if request.of is None:
         return None
-    path = request.of / "profile.csv" if request.of.is_dir() else request.of
-    drive = logs.read_drive(path, model)
+    drive = logs.read_drive(request.of, model)
     motion = simulation.play_back(model, drive.torque, drive.q0, drive.nu0, drive.planned)
     return trajectories.prediction_contrasts(model, motion)
 

@@ -88,6 +88,7 @@ def design_account(found: DesignResult, name: str, problem: Problem, request: De
         "problem": name,
         "duration_s": float(problem.duration_s),
         **design_request.summarise_result(request, found),
+        "excesses": trajectories.excesses_in_units(model, problem, found.design.motion, found.design.violations),
         "meanings": parameter_descriptions(model),
         "wall_s": wall_s,
         "versions": requests.package_versions(),
@@ -111,12 +112,17 @@ def write_drive(model: Model, motion: Motion, place: Path) -> None:
     (place / "machine.json").write_text(model.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
 
 
+def is_own_drive(name: str) -> bool:
+    """Tell a profile or a design's folder from the name of a usual drive."""
+    return name not in trajectories.BASELINES and (bool(Path(name).suffix) or Path(name).is_dir())
+
+
 def read_rivals(
     option: str, against: Sequence[str], model: Model, problem: Problem
 ) -> tuple[tuple[str, ...], dict[str, Score]]:
     """Split what a design is compared with into names of `BASELINES`, and scores of profiles by their files' names.
 
-    option: as an error begins. Raises UsageError for an unknown name or two files of one name, MachineError for an
+    option: as an error begins. Raises UsageError for an unknown name or two drives of one name, MachineError for an
     arm, LogError.
     """
     if model.follows_positions:
@@ -124,13 +130,13 @@ def read_rivals(
             f"{model.machine.name}: is an arm, and falls under the torques of the usual drives; compare designs by"
             " `excite score` instead"
         )
-    usual = tuple(name for name in against if not Path(name).suffix)
-    files = [Path(name) for name in against if Path(name).suffix]
+    usual = tuple(name for name in against if not is_own_drive(name))
+    files = [Path(name) for name in against if is_own_drive(name)]
     for name in usual:
         requests.require_known(option, name, tuple(trajectories.BASELINES))
     twice = sorted({f.name for f in files if [g.name for g in files].count(f.name) > 1})
     if twice:
-        raise UsageError(f"{option}: two files are called {twice[0]}, rename one: a row is named after its file")
+        raise UsageError(f"{option}: two drives are called {twice[0]}, rename one: a row is named after its file")
     drives = {f.name: read_drive(f, model, any_rate=True) for f in files}
     return usual, {
         n: trajectories.score(model, problem, d.torque, d.start, d.nu0, d.planned) for n, d in drives.items()
@@ -183,6 +189,7 @@ def compare_account(
             "median_std_percent": row.median_std_percent,
             "max_violation": row.max_violation,
             "breaks": row.breaks,
+            "excess": _excess(model, row, result.rows[0]),
             "kept": row.kept,
             "samples": row.samples,
             "wall_s": row.wall_s,
@@ -215,6 +222,16 @@ def compare_account(
         partial(reports.rows_frame, shown, "drive"),
         (partial(_write_knots, model, result),),
     )
+
+
+def _excess(model: Model, row: ComparisonRow, designed: ComparisonRow) -> str | None:
+    """Say in units by how much a drive breaks a limit, None where it is a share of its range or nothing."""
+    if row.breaks == trajectories.DURATION_LIMIT:
+        lasts, wanted = (float(np.ptp(r.manoeuvre.times)) for r in (row, designed))
+        return f"it lasts {lasts:g} s instead of {wanted:g} s"
+    if row.breaks is None or not trajectories.is_rest_limit(row.breaks):
+        return None
+    return trajectories.describe_excess(model, row.breaks, row.max_violation)
 
 
 def _knots_file(row: ComparisonRow) -> str:

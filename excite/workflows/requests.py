@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from excite.errors import UsageError
+from excite.text import did_you_mean
 
 # Heavy imports happen inside, so that --help is there at once.
 if TYPE_CHECKING:
@@ -109,7 +110,7 @@ def help_with_choices(option: str, text: str | None) -> str:
 def require_known(what: str, value: str, allowed: Sequence[str]) -> None:
     """Raise UsageError for a value that is not allowed. what: the option, as the message begins."""
     if value not in allowed:
-        raise UsageError(f"{what}: {value} is unknown, allowed: {', '.join(allowed)}")
+        raise UsageError(f"{what}: {value} is unknown, allowed: {', '.join(allowed)}{did_you_mean(value, allowed)}")
 
 
 def require_objective(name: str, machine: Machine, of: Path | None = None) -> None:

@@ -19,16 +19,23 @@ from excite.workflows import design_request, design_workflow, requests
 
 
 def score(
-    place: Path, machine: str, profile: Path, problem: str | None, sensors: bool = False, kit: str = "full"
+    place: Path,
+    machine: str,
+    profile: Path,
+    problem: str | None,
+    sensors: bool = False,
+    kit: str = "full",
+    duration: float | None = None,
 ) -> dict[str, Any]:
     """Judge a profile as a design into a folder; return the summary.
 
-    machine: a shipped name or a path. problem: None for the machine's own. sensors: also find what each sensor of a kit
-    buys. The folder can be verified as a design can.
+    machine: a shipped name or a path. profile: a file, or the folder of a design. problem: None for the machine's own.
+    sensors: also find what each sensor of a kit buys. duration [s]: None for the problem's own. The folder can be
+    verified as a design can.
     Raises UsageError, MachineError, LogError, SimulationError.
     """
     model = requests.build_model(machine, fit_sensor_effects=False)
-    name, chosen = requests.choose_problem(model.machine, problem, None)
+    name, chosen = requests.choose_problem(model.machine, problem, duration)
     model, given = design_request.without_hidden_zeros(model)
     model, assumed = design_request.with_assumed_noise(model)
     design_request.require_noise_figures(model)
@@ -68,6 +75,7 @@ def score_account(
         "median_percent": found.median_percent,
         "max_violation": found.max_violation,
         "violations": found.violations,
+        "excesses": trajectories.excesses_in_units(model, problem, found.motion, found.violations),
         "share_outside_law": found.share_outside_law,
         "meanings": parameter_descriptions(model),
         "versions": requests.package_versions(),
@@ -105,3 +113,10 @@ def judge_limits(model: Model, motion: Motion, placed: bool) -> Mapping[str, flo
     if not placed:
         motion = trajectories.simulate_on_lane(model, problem, motion.u, motion.nu[0])
     return trajectories.check_limits(model, problem, motion)
+
+
+def excesses(model: Model, motion: Motion, violations: Mapping[str, float]) -> dict[str, str]:
+    """Say in units what shares of a range do not, of the violations that `judge_limits` finds."""
+    if model.machine.problem is None:
+        return {}
+    return trajectories.excesses_in_units(model, model.machine.problems[model.machine.problem], motion, violations)

@@ -363,7 +363,7 @@ class StudyPlan:
         for name in sorted(self.machines):
             seen.update(self.machines[name].model_dump_json().encode())
         for name in sorted({d.profile for d in self.drives if d.profile is not None}):
-            seen.update((self.base / name).read_bytes())
+            seen.update(logs.drive_file(self.base / name).read_bytes())
         return seen.hexdigest()
 
     def design_machine(self, drive: DriveSpec) -> Machine:

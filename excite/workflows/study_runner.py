@@ -123,7 +123,7 @@ def _design_drives(plan: StudyPlan, folder: Path, store: RowStore, cluster: str 
         drive = plan.drives[k]
         if drive.profile is not None:
             with output.new_folder(folder / _drive_name(k)) as partial:
-                (partial / "profile.csv").write_bytes((plan.base / drive.profile).read_bytes())
+                (partial / "profile.csv").write_bytes(logs.drive_file(plan.base / drive.profile).read_bytes())
             done += 1
         else:
             job_list.append(_design_job(plan, k, drive))

@@ -15,6 +15,7 @@ from .machine import (
     Sensor as Sensor,
     Spring as Spring,
     Tolerances as Tolerances,
+    is_machine_file as is_machine_file,
     load_machine as load_machine,
     machine_files as machine_files,
     machine_tables as machine_tables,

@@ -32,7 +32,7 @@ from excite.model.machine.records import (
     error_line,
 )
 from excite.model.machine.surroundings import Shape, Tool, World
-from excite.text import did_you_mean
+from excite.text import closest, did_you_mean
 
 MACHINES = Path(__file__).parents[1] / "machines"
 # Kinds of sensor whose place matters, by key of that place.
@@ -589,8 +589,8 @@ class Problem(FileRecord):
     of the `lane_points`. All three are for machines on the plane. reversals: most reversals of the direction of travel.
     rest: start and end at rest. periodic: end as it starts, also in speed, acceleration and jerk, so that the drive can
     be repeated without a stop; rest is then left out. start_pose, end_pose: positions of joints there, by coordinate;
-    those that are not given start at zero, or in the middle of a range without zero, and end where they start. An arm's
-    joints without either start where the search finds best.
+    those that are not given start at zero, or in the middle of a range with zero outside or at an end, and end where
+    they start. An arm's joints without either start where the search finds best.
     """
 
     source: Source
@@ -1168,11 +1168,28 @@ def _find(name: str) -> Path:
         own = Path(f"{name}.toml")
         if own.is_file():
             raise MachineError(f"{name}: is no shipped machine; for the file beside it write {own}")
-        hint = did_you_mean(name, (*shipped_machines(), *(p.name for p in sorted(Path().glob("*.toml")))))
         raise MachineError(
-            f"{name}: no such machine, allowed: {', '.join(shipped_machines())}, or a path to a .toml file{hint}"
+            f"{name}: no such machine, allowed: {', '.join(shipped_machines())}, or a path to a .toml file"
+            f"{_similar_machine(path)}"
         )
     if not path.is_file():
-        hint = did_you_mean(name, (str(p) for p in sorted(path.parent.glob("*.toml"))))
-        raise MachineError(f"{name}: no such file{hint}")
+        raise MachineError(f"{name}: no such file{_similar_machine(path)}")
     return path
+
+
+def _similar_machine(path: Path) -> str:
+    """Return " (did you mean X?)" for a wrong name: a machine file in the same folder, or a shipped machine."""
+    here = [p for p in sorted(path.parent.glob("*.toml")) if is_machine_file(p)]
+    known = {n: n for n in shipped_machines()} | {p.stem: str(p) for p in here}
+    spelt = {f"{stem}{end}".lower(): name for stem, name in known.items() for end in (".toml", "")}
+    like = closest(path.name.lower(), spelt)
+    return f" (did you mean {spelt[like]}?)" if like else ""
+
+
+def is_machine_file(path: Path) -> bool:
+    """Return True for a TOML file that describes a machine, however wrong."""
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+    except OSError:
+        return False
+    return "[[body]]" in text or text.startswith("extends") or "\nextends" in text

@@ -17,6 +17,7 @@ from support.logs import logged
 
 from excite.app.day import Day
 from excite.app.key_lines import find_line
+from excite.logs import SUFFIXES
 from excite.model import Model
 from excite.simulation import simulate
 
@@ -155,3 +156,12 @@ def test_result_of_other_logs_is_not_shown(log: Path, tmp_path: Path) -> None:
     day.logs = ["other.csv"]
     assert day.result_of("identify") is not None
     assert np.isfinite(day.result_of("identify").time)  # type: ignore[union-attr]
+
+
+def test_the_window_lists_a_log_of_every_format_that_is_read(tmp_path: Path) -> None:
+    every = sorted(str(tmp_path / f"log{ending}") for ending in SUFFIXES)
+    for path in every:
+        Path(path).write_text("")
+    for other in ("profile.csv", "rig.toml", "sheet.pdf"):
+        (tmp_path / other).write_text("")
+    assert Day(tmp_path).known_logs() == every

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 from support.commands import Excite
 
-from excite.identification import identify, needed_sensors
+from excite.identification import identifiability, identify, needed_sensors
 from excite.logs import Log, prepare
-from excite.model import Model
+from excite.model import Model, build
+from excite.model.machine import load_machine
+from excite.reports import estimate_descriptions
 from excite.simulation import Motion, measure, simulate
 
 
@@ -90,3 +93,39 @@ def test_a_value_a_thousand_times_off_leaves_doubt_about_a_unit(emps: Model) -> 
         ready = prepare(emps, [table.assign(qm=factor * table["qm"])], needed_sensors(emps, "joint"))
         estimate = identify(ready.model, ready.logs, "joint")
         assert (estimate.status, "1000 times below the machine file's value" in estimate.doubt) == (status, factor > 1)
+
+
+def test_a_joint_that_runs_into_its_stop_is_named() -> None:
+    """The force at the stop went into friction and offset, and nothing said where it comes from."""
+    rig = build(load_machine(str(Path(__file__).parents[1] / "support" / "rig.toml")))
+    t = np.arange(1000) / 100
+    v = np.interp(t, [1, 1.2, 3, 3.2, 5, 5.2, 7, 7.2], [0, 0.1, 0.1, 0, 0, -0.1, -0.1, 0])
+    q = np.cumsum(v) / 100
+    u = 95.1 * np.gradient(v, 0.01) + 203.5 * v + 20.4 * np.tanh(v / 0.001) - 3.16
+    noise = np.random.default_rng(0).standard_normal((2, len(t)))
+    for push in (0.0, 80.0):
+        pushed = u + push * (q > q.max() - 1e-5) + noise[0]
+        ready = prepare(rig, [pd.DataFrame({"t_s": t, "q_m": q + 1e-6 * noise[1], "u_N": pushed})], ["q1", "u1"])
+        estimate = identify(ready.model, ready.logs, "ols")
+        assert ("carriage stands at 0.2 m, where its travel ends, from 3." in estimate.doubt) == (push > 0)
+    assert "did it run into a stop?" in estimate.doubt
+    assert estimate.status != "valid"
+
+
+def test_advice_that_many_parameters_share_is_given_once(va12: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = va12.base.names
+    advice = dict.fromkeys(names, "drive with changing speed") | {names[0]: "steer"}
+    monkeypatch.setattr(identifiability, "samples", lambda *_: None)
+    monkeypatch.setattr(identifiability, "advise_manoeuvres", lambda *_: advice)
+    poor = SimpleNamespace(names=names, value=0 * va12.scale, std=10 * va12.scale, unidentifiable={})
+    monkeypatch.setattr(identifiability, "replace", lambda estimate, **_: estimate)
+    monkeypatch.setattr(identifiability, "add_notes", lambda _, *notes: notes)
+    said = identifiability.add_advice(va12, [], poor, va12.machine.filter)  # type: ignore[arg-type]
+    assert len(said) == 2
+    assert said[0].startswith(f"{names[0]}: poorly identified")
+    assert said[1].startswith(f"{', '.join(names[1:])}: poorly identified")
+    reasons = {"M": "nothing depends on it", "ZZ1": "nothing depends on it", "Fv1": "the roll rests"}
+    assert estimate_descriptions._describe_reasons(reasons) == [
+        "M, ZZ1 can't be identified: nothing depends on it.",
+        "Fv1 can't be identified: the roll rests.",
+    ]

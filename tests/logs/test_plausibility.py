@@ -276,3 +276,29 @@ def test_a_counted_angle_that_is_held_is_a_doubt_said_once(
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["status"] == "doubtful"
     assert sum("changes in every second row only" in note for note in summary["notes"]) == 1
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-6])
+def test_a_constant_speed_is_no_rounding(noise: float) -> None:
+    """Readings at a constant speed go on by equal steps; rounded ones by steps that vary."""
+    exact = 0.0197 * T + noise * np.random.default_rng(0).standard_normal(len(T))
+    there_and_back = np.cumsum(np.sign(np.sin(2 * np.pi * T / 8)) * 1.97e-4)
+    assert plausibility.step_of(exact) == 0
+    assert plausibility.step_of(there_and_back) == 0
+    for moving in (exact, np.sin(T)):
+        assert plausibility.step_of(np.round(moving, 3)) == pytest.approx(1e-3)
+
+
+def test_a_position_that_comes_to_rest_is_not_at_the_end_of_its_range(excite: Excite, tmp_path: Path) -> None:
+    rig = Path(__file__).parents[1] / "support" / "rig.toml"
+    v = np.convolve(
+        np.interp(T, [0, 2, 2.2, 4, 4.2, 8, 8.2, 10], [0, 0, 0.05, 0.05, 0, 0, -0.05, -0.05]), np.ones(20) / 20, "same"
+    )
+    q = np.round(np.cumsum(v) / 100, 6)
+    u = 95.1 * np.gradient(v, 0.01) + 203.5 * v + 20.4 * np.tanh(v / 0.001) - 3.16
+    u += np.random.default_rng(0).standard_normal(len(T))
+    for top, said in ((np.inf, False), (0.07, True)):
+        table = pd.DataFrame({"t_s": T, "q_m": np.minimum(q, top), "u_N": u})[:1100]
+        table.to_csv(tmp_path / "log.csv", index=False)
+        _, stdout, _ = excite("log", "check", tmp_path / "log.csv", "--machine", rig, "--out", tmp_path / "c")
+        assert ("stands at its highest value" in stdout) == said

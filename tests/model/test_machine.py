@@ -699,11 +699,25 @@ def test_a_flood_of_keys_or_digits_is_one_line(change: Callable[[str], str], wor
     assert len(str(err.value)) < 2000
 
 
-def test_a_misspelt_machine_suggests_the_files_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_misspelt_machine_suggests_a_machine_file_or_a_shipped_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "my_roller.toml").write_text("")
-    for wrong in ("my_rolller.toml", "my_roler"):
-        with pytest.raises(MachineError, match=r"did you mean my_roller\.toml\?"):
+    Path("my_rig.toml").write_text('extends = "emps"\n')
+    Path("my_rigs.toml").write_text("[study]\n")  # no machine
+    Path("other").mkdir()
+    Path("other/my_rig.toml").write_text("[[body]]\n")
+    for wrong, right in {
+        "my_rgi.toml": r"my_rig\.toml",
+        "my_rgi": r"my_rig\.toml",
+        "my_rigss": r"my_rig\.toml",
+        "MY_RIG.tml": r"my_rig\.toml",
+        "other/my_rgi.toml": r"other/my_rig\.toml",
+        "va12x": "va12",
+        "VA12": "va12",
+        "va12.toml": "va12",
+    }.items():
+        with pytest.raises(MachineError, match=rf"did you mean {right}\?"):
             load_machine(wrong)
-    with pytest.raises(MachineError, match=r"did you mean va12\?"):
-        load_machine("va12x")
+    with pytest.raises(MachineError, match=r"allowed: .*, or a path to a \.toml file$"):
+        load_machine("qqq")

@@ -11,8 +11,8 @@ import pytest
 from excite import reports, simulation, trajectories, workflows
 from excite.errors import MachineError, UsageError
 from excite.model import Model, build
-from excite.model.machine import Problem, load_machine
-from excite.trajectories import JointMotion, MotionProgram, joint_motion, joint_search
+from excite.model.machine import Body, Problem, load_machine
+from excite.trajectories import JointMotion, MotionProgram, joint_motion, joint_search, multistart
 from excite.workflows import DesignRequest, choose_problem, design_from, prepare_design
 
 ARM = Path(__file__).parents[1] / "support" / "two_joints.toml"
@@ -225,3 +225,67 @@ def test_design_takes_zeros_that_no_torque_shows_from_the_file(arm: Model, probl
     assert found.given_zeros == ("q20",)
     assert found.model.base.names == (*arm.base.names, "q10")
     assert found.design.cond_phi < 1e4
+
+
+# ------------------------------------------------------------------------------------------------ weight
+
+RIG = ARM.with_name("rig.toml")
+OVERLOADED = {
+    "slide": (RIG, 'value = "pi/2"', "value = 0", "carriage with 933 N in every pose, .* limit of 150 N; raise torque"),
+    "given pose": (
+        ARM,
+        "value = 40,",
+        "value = 8,",
+        r"upper_arm with 16 N m at theta1 -0\.4 rad, theta2 0\.5 rad, .* 8",
+    ),
+    "chosen pose": (
+        ARM,
+        "value = 40,",
+        "value = 1e-3,",
+        r"none of 1000 random poses .* even in the best .* upper_arm with [\d.]+ N m at theta1 [-\d.]+ rad",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", OVERLOADED)
+def test_a_weight_beyond_the_drives_is_named(case: str, tmp_path: Path) -> None:
+    file, before, after, words = OVERLOADED[case]
+    text = file.read_text().replace(before, after, 1)
+    if case == "chosen pose":
+        text = text.replace("start_pose", "# start_pose").replace("end_pose", "# end_pose")
+    (tmp_path / "weak.toml").write_text(text)
+    request = DesignRequest(starts=1, budget_s=1)
+    model, _, problem = prepare_design(str(tmp_path / "weak.toml"), None, None, request)
+    with pytest.raises(MachineError, match=words):
+        design_from(model, problem, request)
+
+
+def test_a_search_that_exceeds_a_torque_limit_says_what_gravity_takes(arm: Model) -> None:
+    aim = trajectories.compose_objective(arm, "cond")
+    enough = multistart.infeasible_error(arm, aim, {"torque u1": 0.1}, complete=False)
+    assert "give more time" in str(enough)
+    weak = build(load_machine(str(ARM)).model_copy(update={"body": tuple(_weaker(b) for b in arm.machine.body)}))
+    said = str(multistart.infeasible_error(weak, aim, {"torque u1": 0.1}, complete=False))
+    assert "gravity loads upper_arm with" in said
+    assert "more than its torque limit of 4 N m" in said
+    assert "more time" not in said
+
+
+def test_a_drive_without_rest_begins_with_room_where_zero_ends_a_range(tmp_path: Path) -> None:
+    """At zero, with the upper arm level, the torque limit of 14 N m doesn't hold the arm of 16.7 N m, and needn't."""
+    text = ARM.read_text().replace("value = 40,", "value = 14,", 1)
+    text = text.replace("position = { value = 2,", "position_high = { value = 1.45,", 1)
+    text = text.replace("[body.limit]", '[body.limit]\nposition_low = { value = 0, source = "definition" }', 1)
+    text = text.replace("start_pose", "rest = false\nperiodic = true\n# start_pose").replace("end_pose", "# end_pose")
+    (tmp_path / "onesided.toml").write_text(text)
+    model, _, problem = prepare_design(str(tmp_path / "onesided.toml"), None, None, DesignRequest())
+    assert joint_search.end_poses(model, problem)[0][0] == pytest.approx(1.45 / 2)
+    assert len(joint_search.free_poses(model, problem)) > 10
+
+
+def _weaker(body: Body) -> Body:
+    torque = body.limit.torque
+    assert torque is not None
+    return body.model_copy(
+        update={"limit": body.limit.model_copy(update={"torque": torque.model_copy(update={"value": 4.0})})}
+    )

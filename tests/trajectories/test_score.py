@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +14,14 @@ from support.commands import Excite
 
 import excite as program
 from excite.errors import LogError
-from excite.logs import profile_of, read_drive
-from excite.model import Model
-from excite.simulation import Motion
-from excite.trajectories import score
+from excite.logs import is_profile, profile_of, read_drive
+from excite.model import Model, build
+from excite.model.machine import load_machine
+from excite.simulation import Motion, simulate
+from excite.trajectories import check_limits, describe_excess, excesses_in_units, prediction_contrasts, score
+from excite.trajectories.multistart import no_drive_yet
+from excite.workflows import DesignRequest, read_rivals, read_study
+from excite.workflows.design_request import contrasts
 
 RESULTS = Path(__file__).parents[2] / "results"
 
@@ -73,7 +79,7 @@ def test_a_broken_limit_is_measured_in_its_range(excite: Excite, straight: Model
     assert "limits broken:" in stdout.splitlines()[1]
     asked = ("simulate", "va12_straight", tmp_path / "p.csv", "--out", tmp_path / "log.csv")
     _, stdout, _ = excite(*asked)
-    assert stdout.splitlines()[1].startswith("limits broken: rest x0' by ")
+    assert re.match(r"limits broken: x0 still moves at [\d.]+ m/s at the end; theta", stdout.splitlines()[1])
     told = json.loads(excite(*asked, "--json")[1])["violations"]
     assert told == pytest.approx({name: v for name, v in found.violations.items() if name != "duration"})
 
@@ -83,6 +89,78 @@ def test_a_drive_that_is_too_short_breaks_the_duration(straight: Model) -> None:
     found = score(straight, problem, pulses(10, 1500, 1500))
     assert found.violations["duration"] == pytest.approx(0.75)
     assert np.isfinite(found.cond_phi)
+
+
+def test_a_drive_of_another_length_is_said_so_and_judged_by_its_own_on_request(excite: Excite, tmp_path: Path) -> None:
+    rig = str(Path(__file__).parents[1] / "support" / "rig.toml")
+    table_of(build(load_machine(rig)), pulses(4, 60)).rename(columns={"u1_Nm": "u1_N"}).to_csv(tmp_path / "p.csv")
+    asked = ("score", rig, tmp_path / "p.csv", "--out", tmp_path / "s")
+    _, stdout, _ = excite(*asked)
+    assert "it lasts 4 s, and the problem asks for 10 s" in stdout.splitlines()[1]
+    assert "`--duration 4` judges it" in stdout
+    _, stdout, _ = excite(*asked, "--duration", 4)
+    assert "it lasts" not in stdout
+    code, _, err = excite(*asked, "--duration", 0.1)
+    assert (code, "--duration: must be between" in err) == (2, True)
+
+
+def test_rest_is_missed_by_a_speed_at_either_end(straight: Model) -> None:
+    problem = straight.machine.problems["S40"]
+    motion = simulate(straight, pulses(10, 1500, 1500)[:300])
+    over = check_limits(straight, problem, motion)
+    v, w = (f"{motion.nu[-1, k]:.3g}" for k in (0, 1))
+    said = excesses_in_units(straight, problem, motion, over)
+    assert said["rest x0'"] == f"x0 still moves at {v} m/s at the end"
+    assert said["rest theta1'"] == f"theta1 still moves at {w} rad/s at the end"
+    backward = replace(motion, nu=motion.nu[::-1], q=motion.q[::-1])
+    assert excesses_in_units(straight, problem, backward, over)["rest x0'"] == f"x0 moves at {v} m/s at the start"
+    assert describe_excess(straight, "torque u1", 0.1) == "torque u1 is exceeded by 10.00 % of its range"
+    assert no_drive_yet(straight, over).endswith((f"{v} m/s at the end", f"{w} rad/s at the end"))
+
+
+def test_the_folder_of_a_drive_is_taken_as_the_drive(
+    excite: Excite, straight: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = Path("campaign") / "drive-1"
+    folder.mkdir(parents=True)
+    table_of(straight, pulses(3, 1500, 1500)).to_csv(folder / "profile.csv", index=False)
+    file = read_drive(folder / "profile.csv", straight)
+    np.testing.assert_array_equal(read_drive(folder, straight).torque, file.torque)
+    assert is_profile(folder, straight)
+    usual, own = read_rivals("--against", ["chirp", str(folder)], straight, straight.machine.problems["S40"])
+    assert (usual, list(own)) == (("chirp",), ["drive-1"])
+    assert contrasts(straight, DesignRequest("prediction", of=folder)) is not None
+    assert excite("score", "va12_straight", folder, "--out", "s")[0] == 0
+    assert excite("simulate", "va12_straight", folder, "--out", "log.csv")[0] == 0
+    Path("study.toml").write_text(
+        'name = "s"\nruns = 1\n[[grid]]\nmachine = "va12_straight"\nprofile = "campaign/drive-1"\n'
+    )
+    assert read_study("study.toml").fingerprint
+
+    def refusal(*arguments: object) -> str:
+        code, _, err = excite(*arguments)
+        assert code == 2
+        assert err.count("\n") == 1
+        return err
+
+    assert "is what the log is made from" in refusal(
+        "simulate", "va12_straight", folder, "--out", folder / "profile.csv"
+    )
+    for asked in (("score", "va12_straight", "campaign"), ("verify", "campaign"), ("drive", "campaign")):
+        assert f"has no profile.csv, but folders with one: give one of them, such as {folder}" in refusal(*asked)
+    assert "`excite score MACHINE profile.csv` makes one of any drive" in refusal("verify", folder / "profile.csv")
+    assert "is the folder of a drive, no log" in refusal("identify", "va12_straight", folder)
+
+
+def test_torques_of_a_rig_along_a_drive_can_be_what_is_predicted() -> None:
+    """Contrasts are the columns of the regressor at the samples, in reference values over the torque's rms."""
+    rig = build(load_machine(str(Path(__file__).parents[1] / "support" / "rig.toml")))
+    motion = simulate(rig, pulses(2, 60))
+    found = prediction_contrasts(rig, motion)
+    at = np.unique(np.linspace(0, len(motion.t) - 1, 51).round().astype(int))[1:]
+    W = rig.stacked_regressor(motion.q.T, motion.nu.T, motion.a.T)[at, 0] * np.append(rig.nominal[:3], 0)
+    np.testing.assert_allclose(found, W.T / np.sqrt(np.mean(motion.u**2)))
 
 
 def test_a_drive_without_excitation_shows_nothing(excite: Excite, straight: Model, tmp_path: Path) -> None:
