@@ -42,7 +42,8 @@ SQUARE_TOLERANCE = 0.2  # relative deviation of values from the square of a gear
 STANDS = 0.01  # share of a joint's largest speed below which it stands; chosen
 STANDS_S = 0.2  # [s] that it stands at the end of its travel, at least; chosen
 NEAR_END = 0.005  # share of a joint's travel within which its end is; chosen
-PUSH = 2.0  # times its dry friction, beyond which a torque moves a joint unless a stop holds it; chosen
+SLOWLY = 0.1  # of a joint's largest speed, at which its friction is taken; chosen
+PUSH = 2.0  # times its friction, beyond which a torque moves a joint unless a stop holds it; chosen
 LEAST_PUSH = 0.1  # of its largest torque, which such a torque is at least; chosen
 CAUSES = "the sign of a torque or angle column, a unit, or a radius in the machine file"
 
@@ -103,20 +104,19 @@ def _stops(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter
         for body in model.machine.actuated:
             k = model.coordinates.index(model.machine.coordinate(body))
             x, v = s.q[k], np.abs(s.nu[k])
-            friction = float(body.friction.Fs) if body.friction is not None else 0.0
-            enough = max(PUSH * friction, LEAST_PUSH * float(np.abs(s.Y[k]).max()))
             for end, outward in ((x.max(), 1.0), (x.min(), -1.0)):
                 stands = np.flatnonzero((np.abs(x - end) < NEAR_END * np.ptp(x)) & (v < STANDS * v.max()))
                 if len(stands) * float(np.diff(log.t).min()) < STANDS_S:
                     continue
                 q = s.q[:, stands]
-                W = model.stacked_regressor(q, 0 * q, 0 * q)[:, k]
+                slow = np.zeros_like(q)
+                slow[k] = outward * SLOWLY * v.max()
+                load, turning = (model.stacked_regressor(q, nu, 0 * q)[:, k] for nu in (0 * q, slow))
+                either = (model.nominal, estimate.value_or(model.nominal))
+                friction = max(float(np.abs((turning - load) @ X).max()) for X in either)
                 push = np.zeros(len(x))
-                push[stands] = np.min(
-                    [outward * (s.Y[k, stands] - W @ X) for X in (model.nominal, estimate.value_or(model.nominal))],
-                    axis=0,
-                )
-                held = push > enough
+                push[stands] = np.min([outward * (s.Y[k, stands] - load @ X) for X in either], axis=0)
+                held = push > max(PUSH * friction, LEAST_PUSH * float(np.abs(s.Y[k]).max()))
                 edges = np.flatnonzero(np.diff(np.concatenate([[0], held, [0]])))
                 runs = [
                     r for r in zip(edges[::2], edges[1::2] - 1, strict=True) if log.t[r[1]] - log.t[r[0]] > STANDS_S

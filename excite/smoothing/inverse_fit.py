@@ -428,8 +428,8 @@ def with_bounded_pull(state: State, reduced: Reduced) -> State:
     p, n = len(state.pull), len(state.pull) + state.problem.channels
     information = reduced.information[:n, :n] + _priors(state, n)[0]
     step = np.linalg.solve(information, np.concatenate([state.pull, np.zeros(n - p)]))
-    share = 1 / max(float(np.sqrt(max(state.pull @ step[:p], 0.0))), 1.0)
-    curve_pull = share * reduced.information[n:, :n] @ step
+    share = 1 / max(float(np.sqrt(np.maximum(state.pull @ step[:p], 0.0))), 1.0)
+    curve_pull: np.ndarray = share * (reduced.information[n:, :n] @ step)
     return replace(state, pull=share * state.pull, curve_pull=curve_pull)
 
 
