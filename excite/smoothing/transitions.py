@@ -145,10 +145,9 @@ class _Integration:
         else:
             bad, good = np.empty(0, int), np.arange(len(y))
             end[~solved] = np.nan
-        if len(good):
-            self.steps.append(
-                (interval[good], np.full(len(good), at), np.full(len(good), share), stages[good], inputs[good])
-            )
+        self.steps.append(
+            (interval[good], np.full(len(good), at), np.full(len(good), share), stages[good], inputs[good])
+        )
         if len(bad):
             half = share / 2
             middle = self.run(interval[bad], y[bad], None, at, half, splits - 1)

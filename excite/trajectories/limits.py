@@ -445,7 +445,7 @@ def describe_overload(model: Model, poses: np.ndarray) -> str:
     if load[at, k] <= limit[k]:
         return ""
     pose = ", ".join(
-        f"{c} {x:.3g} {'rad' if c.startswith('theta') else 'm'}"
+        f"{c} {format_number(x, 3)} {'rad' if c.startswith('theta') else 'm'}"
         for c, x in zip(model.coordinates, poses[at], strict=True)
     )
     unit = "N m" if bodies[k].joint == "revolute" else "N"

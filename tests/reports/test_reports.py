@@ -117,8 +117,8 @@ def test_design_answers_with_what_can_be_known() -> None:
     assert tables[0].rows[0][0] == "u20"
     described = describe("design", summary | {"max_violation": 0.02, "violations": {"power": 0.02}})
     answer, tables = described.headline, described.tables
-    assert "limits are exceeded by 2.00 %" in answer
-    assert tables[1].rows == (("power", "2.000"),)
+    assert "limits broken: power by 2 % of the range" in answer
+    assert tables[1].rows == (("power", "2.000 % of its range"),)
 
 
 def test_compare_says_which_way() -> None:
