@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,6 +15,9 @@ from excite.cli.application import write_check
 from excite.cli.options import DrawingCommand, JsonOption, OutOption
 from excite.errors import InputError, UsageError
 from excite.text import count
+
+if TYPE_CHECKING:
+    from excite.identification import SavedEstimate
 
 commands = typer.Typer()
 
@@ -93,12 +97,27 @@ def new_machine(
         raise UsageError("--from: writes a whole file, --like one that extends another: leave one out")
     out = out or Path(f"{name}.toml")
     notes = machine_template.start(name, out, like, origin)
+    _say_written(name, out, f"{out}: change what differs, then `excite machine check {out}`", notes, json)
+
+
+def _say_written(machine: str, out: Path, what: str, notes: Sequence[str], json: bool) -> None:
+    """Say what was written into a file for a machine, and what to know of it."""
     if json:
-        terminal.show_json({"machine": name, "file": str(out), "notes": list(notes)})
+        terminal.show_json({"machine": machine, "file": str(out), "notes": list(notes)})
         return
-    terminal.say(f"{out}: change what differs, then `excite machine check {out}`")
+    terminal.say(what)
     for line in notes:
         terminal.say(f"- {line}")
+
+
+def _read_usable_estimate(result: Path) -> SavedEstimate:
+    """Read the estimate in a folder. Raises UsageError for an invalid one."""
+    from excite import identification
+
+    saved = identification.read_estimate(result)
+    if saved.estimate.status == "invalid":
+        raise UsageError(f"{result}: holds no estimate: {saved.estimate.doubt}")
+    return saved
 
 
 @machine_files.command("urdf")
@@ -114,22 +133,16 @@ def write_urdf(
 
     Example: excite machine urdf results/identify-my_arm --from robot.urdf --out identified.urdf
     """
-    from excite import identification, output
+    from excite import output
 
     if out.resolve() == origin.resolve():
         raise UsageError(f"--out {out}: is what the robot is read from, choose another file")
-    saved = identification.read_estimate(result)
-    if saved.estimate.status == "invalid":
-        raise UsageError(f"{result}: holds no estimate: {saved.estimate.doubt}")
+    saved = _read_usable_estimate(result)
     text, notes = workflows.urdf_with_estimate(origin, saved.model, saved.estimate)
     with output.new_file(out) as part:
         part.write_text(text, encoding="utf-8")
-    if json:
-        terminal.show_json({"machine": saved.model.machine.name, "file": str(out), "notes": notes})
-        return
-    terminal.say(f"{out}: {count(len(saved.model.machine.body), 'link')} with identified inertia")
-    for line in notes:
-        terminal.say(f"- {line}")
+    what = f"{out}: {count(len(saved.model.machine.body), 'link')} with identified inertia"
+    _say_written(saved.model.machine.name, out, what, notes, json)
 
 
 @machine_files.command("model")
@@ -151,20 +164,14 @@ def write_model(
         raise UsageError(
             f"--out {out}: ends in {out.suffix or 'nothing'}, allowed: {', '.join(workflows.MODEL_WRITERS)}"
         )
-    saved = identification.read_estimate(result)
-    if saved.estimate.status == "invalid":
-        raise UsageError(f"{result}: holds no estimate: {saved.estimate.doubt}")
+    saved = _read_usable_estimate(result)
     standard, far = identification.possible_standard(saved.model, saved.estimate)
     made, notes = workflows.MODEL_WRITERS[out.suffix](saved.model.machine, standard)
     notes = [*notes, *([] if far is None else [far])]
     with output.new_file(out) as part:
         part.write_bytes(made if isinstance(made, bytes) else made.encode())
-    if json:
-        terminal.show_json({"machine": saved.model.machine.name, "file": str(out), "notes": notes})
-        return
-    terminal.say(f"{out}: {count(len(saved.model.machine.body), 'body', 'bodies')} with identified parameters")
-    for line in notes:
-        terminal.say(f"- {line}")
+    what = f"{out}: {count(len(saved.model.machine.body), 'body', 'bodies')} with identified parameters"
+    _say_written(saved.model.machine.name, out, what, notes, json)
 
 
 @machine_files.command("check", cls=DrawingCommand)

@@ -19,6 +19,7 @@ import scipy
 from excite.identification.estimate import FitTest
 from excite.identification.white_residuals import SIMULATIONS, Courses, WhiteResiduals
 from excite.model import Model
+from excite.smoothing import torque_sensor
 from excite.text import format_number
 
 FALSE_ALARM = 1e-3  # probability that any test of a right estimate fails, were the machine linear; chosen
@@ -250,8 +251,7 @@ def _course_tests(
             amount = -(axes[:, seen] @ (shares[:, 0] / value[seen])) / unit
             rms = float(np.sqrt(np.mean((error[:, at] @ amount) ** 2)))
             of = float(np.sqrt(np.mean([one.misfit[drive] ** 2 for one in white])))
-            straight = not model.coordinates[model.actuated[drive]].startswith("theta")
-            unit_text = model.machine.torque_unit or ("N" if straight else "N m")
+            unit_text = model.machine.si_unit(torque_sensor(model, model.machine.actuated[drive].index))
             text = (
                 f"{name}: residuals follow the {family}, {format_number(rms, 2)} {unit_text}"
                 f" of {format_number(max(of, rms), 2)}"

@@ -12,7 +12,7 @@ import scipy
 from excite.errors import NotConsistentError
 from excite.identification.estimate import Estimate, add_notes
 from excite.identification.fit_tests import describe_failures
-from excite.logs import Log, samples
+from excite.logs import Log, samples, stretches
 from excite.model import Model, required_signs
 from excite.model.machine import Filter
 from excite.text import format_number, format_p_value
@@ -117,10 +117,7 @@ def _stops(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter
                 push = np.zeros(len(x))
                 push[stands] = np.min([outward * (s.Y[k, stands] - load @ X) for X in either], axis=0)
                 held = push > max(PUSH * friction, LEAST_PUSH * float(np.abs(s.Y[k]).max()))
-                edges = np.flatnonzero(np.diff(np.concatenate([[0], held, [0]])))
-                runs = [
-                    r for r in zip(edges[::2], edges[1::2] - 1, strict=True) if log.t[r[1]] - log.t[r[0]] > STANDS_S
-                ]
+                runs = [(a, b) for a, b in stretches(held) if log.t[b] - log.t[a] > STANDS_S]
                 if runs:
                     a, b = runs[0]
                     unit, force = ("rad", "N m") if body.joint == "revolute" else ("m", "N")

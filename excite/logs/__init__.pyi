@@ -1,3 +1,4 @@
+from .checks import stretches as stretches
 from .conversion import convert as convert, table_from as table_from
 from .filtered import (
     BLOCK as BLOCK,

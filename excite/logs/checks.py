@@ -438,6 +438,12 @@ def constant(record: Record) -> Iterator[Finding]:
             yield Finding("constant", "remark", c.sensor.name, line)
 
 
+def stretches(yes: np.ndarray) -> list[tuple[int, int]]:
+    """Return the stretches (first, last row) in which a condition (N,) holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], yes, [0]])))
+    return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
 def ends_of_range(record: Record) -> Iterator[Finding]:
     """Find analogue channels that stand at their highest or lowest reading while the machine moves."""
     for c in record.of("range"):
@@ -445,8 +451,7 @@ def ends_of_range(record: Record) -> Iterator[Finding]:
             continue
         frozen = dropouts_of(c, record)
         for end, word in ((c.x.max(), "highest"), (c.x.min(), "lowest")):
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], c.x == end, [0]])))
-            runs = [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= STUCK]
+            runs = [(a, b) for a, b in stretches(c.x == end) if b - a + 1 >= STUCK]
             runs = [r for r in runs if r not in frozen and _moved(record, c, *r) and not _comes_to_rest(c, *r)]
             if runs:
                 rows = max(b - a + 1 for a, b in runs)

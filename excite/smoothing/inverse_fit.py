@@ -24,7 +24,7 @@ from excite.smoothing.inverse import (
 )
 from excite.smoothing.inverse_chain import TorqueModel, build_chain, torque_sensors
 from excite.smoothing.inverse_sizes import correlation_factor, update_sizes
-from excite.smoothing.log_fit import HELD_STD, MAX_IDENTIFIABLE_STD, NotConvergedError, prior_information, prior_terms
+from excite.smoothing.log_fit import HELD_STD, NotConvergedError, held_in_turn, prior_information, prior_terms
 from excite.smoothing.motion_readings import JointMotion, Readings, choose_knots, read_motion, speed_std
 
 LEAST_NOISE_SHARE = 1e-3  # of the torque's root mean square; no sensor is better
@@ -375,15 +375,7 @@ def find_held(state: State, reduced: Reduced) -> np.ndarray:
     prior, _ = _priors(free, p)
     covariance = np.linalg.inv(information + prior)[: len(X), : len(X)]
     size = np.maximum(np.abs(X) / model.scale, 1.0)
-    held = np.zeros(len(X), bool)
-    left = covariance.copy()
-    while True:
-        excess = np.where(held, 0.0, np.sqrt(np.maximum(np.diag(left), 0.0)) / size)
-        k = int(np.argmax(excess))
-        if not excess[k] > MAX_IDENTIFIABLE_STD:
-            return held
-        held[k] = True
-        left = left - np.outer(left[:, k], left[k]) / left[k, k]
+    return held_in_turn(covariance, size, np.zeros(len(X), bool))
 
 
 def curve_sizes(state: State, reduced: Reduced, admit: bool) -> Sizes:

@@ -72,6 +72,11 @@ class Fit:
     def std(self) -> np.ndarray:
         return np.sqrt(np.diag(self.covariance))
 
+    @property
+    def indices(self) -> list[np.ndarray]:
+        """For each log, the places of parameters, coefficients and own offsets among those of all logs."""
+        return places(len(self.X), self.unknown, [len(t.offset) for t in self.trajectories])
+
     def required(self) -> Fit:
         """Return the fit if it converged. Raises NotConvergedError."""
         if self.status == "converged":
@@ -81,6 +86,16 @@ class Fit:
             f" {format_number(self.step, 3)} standard deviations): check the log with `excite log check` and `excite"
             " diagnose`, or start from better values in the machine file"
         )
+
+
+def places(n: int, unknown: UnknownForces, offsets: Sequence[int]) -> list[np.ndarray]:
+    """Return, for each log, the places of n parameters, its coefficients and its own offsets among those of all logs.
+
+    offsets: their number in each log.
+    """
+    ends = n + unknown.count + np.cumsum(offsets)
+    logs = zip(unknown.index, ends, offsets, strict=True)
+    return [np.r_[0:n, n + index, end - count : end] for index, end, count in logs]
 
 
 def prior_information(model: Model, held: np.ndarray, X: np.ndarray) -> np.ndarray:
@@ -176,12 +191,7 @@ class LogProblem:
     @property
     def indices(self) -> list[np.ndarray]:
         """For each log, the places of parameters, coefficients and own offsets among those of all logs."""
-        n_p, n_c = len(self.prior), self.unknown.count
-        ends = n_p + n_c + np.cumsum([len(data.offset_sensors) for data in self.measurements])
-        return [
-            np.r_[0:n_p, n_p + index, end - len(data.offset_sensors) : end]
-            for data, index, end in zip(self.measurements, self.unknown.index, ends, strict=True)
-        ]
+        return places(len(self.prior), self.unknown, [len(data.offset_sensors) for data in self.measurements])
 
     def enter(self, point: Point) -> bool:
         """Evaluate a point; return False if soil pushes, a mass matrix is not positive, or no motion follows."""
@@ -358,30 +368,17 @@ def fit_logs(
     held: np.ndarray,
     process_noise: float = 0.0,
     settings: Settings = DEFAULT,
+    unknown: UnknownForces | None = None,
+    probed: bool = False,
+    pull: Determinant | None = None,
 ) -> Fit:
     """Find the most likely parameters and trajectories of logs; the fit has a status.
 
     trajectories, X (n_base,): where the iteration starts. starts: trajectories whose first states are the prior means
-    of the first states. held (n_base,): parameters that stay at the machine file's values.
+    of the first states. held (n_base,): parameters that stay at the machine file's values. unknown: forces beside the
+    model, of given sizes. probed, pull: see `LogProblem`.
     """
-    unknown = no_unknown_forces(space, len(measurements))
-    return fit_with_unknown_forces(space, measurements, trajectories, X, starts, held, unknown, process_noise, settings)
-
-
-def fit_with_unknown_forces(
-    space: StateSpace,
-    measurements: Sequence[Measurements],
-    trajectories: Sequence[Trajectory],
-    X: np.ndarray,
-    starts: Sequence[Trajectory],
-    held: np.ndarray,
-    unknown: UnknownForces,
-    process_noise: float = 0.0,
-    settings: Settings = DEFAULT,
-    probed: bool = False,
-    pull: Determinant | None = None,
-) -> Fit:
-    """Find the most likely parameters and trajectories of logs beside unknown forces of given sizes."""
+    unknown = no_unknown_forces(space, len(measurements)) if unknown is None else unknown
     X = np.where(held, space.model.nominal, X)
     point = Point(X, tuple(trajectories))
 
@@ -477,8 +474,15 @@ def find_unidentifiable(problem: LogProblem, quadratic: Quadratic, held: np.ndar
     judged = np.flatnonzero(problem.held & ~held)
     information[judged, judged] += (prior_information(model, held, X) - problem.prior)[judged]
     size = np.maximum(np.abs(X) / model.scale, 1.0)
-    left = solver.inverse(information)[: len(X), : len(X)]
-    found = held.copy()
+    return held_in_turn(solver.inverse(information)[: len(X), : len(X)], size, held)
+
+
+def held_in_turn(covariance: np.ndarray, size: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Hold parameters (n,), besides `held`, one after another until no other's standard deviation exceeds its size.
+
+    covariance (n, n), scaled; size (n,), over the scale.
+    """
+    left, found = covariance, held.copy()
     while True:
         excess = np.where(found, 0.0, np.sqrt(np.maximum(np.diag(left), 0.0)) / size)
         k = int(np.argmax(excess))
@@ -538,13 +542,6 @@ def newton_step(
         )
     step = -covariance @ slope
     return covariance, [step[own] for own in problem.indices], cost + float(slope @ step)
-
-
-def parameter_indices(space: StateSpace, measurements: Sequence[Measurements]) -> list[np.ndarray]:
-    """Return, for each log, the indices of the parameters and of its own offsets among those of all logs."""
-    n = len(space.model.scale)
-    ends = n + np.cumsum([len(data.offset_sensors) for data in measurements])
-    return [np.r_[0:n, end - len(data.offset_sensors) : end] for data, end in zip(measurements, ends, strict=True)]
 
 
 def covariance_in_si(space: StateSpace, covariance: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 
 from excite.smoothing.innovations import whiten
 from excite.smoothing.linearisation import StateSpace
-from excite.smoothing.log_fit import Fit, fit_with_unknown_forces, linearise_with
+from excite.smoothing.log_fit import Fit, fit_logs, linearise_with
 from excite.smoothing.measurements import Measurements, Trajectory
 from excite.smoothing.solver import Settings, inverse
 from excite.smoothing.unknown_forces import UnknownForces, catalogue
@@ -65,8 +65,8 @@ def fit_unknown_forces(
             trajectories = _without_coefficients(trajectories, unknown)
         else:
             unknown = replace(unknown, size=size)
-        latest = fit_with_unknown_forces(
-            space, logs, trajectories, X, starts, held, unknown, settings=settings, probed=True, pull=pull
+        latest = fit_logs(
+            space, logs, trajectories, X, starts, held, settings=settings, unknown=unknown, probed=True, pull=pull
         )
         unmoved = any(t.force_error is None for t in latest.trajectories)
         lost = unmoved or not latest.linear or not latest.cost > 0
@@ -103,10 +103,7 @@ def clustered_inflation(fit: Fit, rate: float) -> np.ndarray:
     """
     covariance, n = inverse(fit.information), len(fit.X)
     meat = np.zeros_like(covariance)
-    end = n + fit.unknown.count
-    for log, index in zip(fit.linear, fit.unknown.index, strict=True):
-        offsets = len(log.Z) - 2 - n - len(index)
-        own, end = np.r_[0:n, n + index, end : end + offsets], end + offsets
+    for log, own in zip(fit.linear, fit.indices, strict=True):
         E = whiten(log).E[:, :, :-1]
         score = np.einsum("kmc,km->kc", E[:, :, 1:], E[:, :, 0]).astype(float)
         starts = np.arange(0, len(score), int(CLUSTER_S * rate))
@@ -195,18 +192,12 @@ def white_noise_ratios(fit: Fit) -> np.ndarray:
 
     The fit must be probed: what a draw of all noise leaves is the expectation.
     """
-    slope, n_c = np.zeros(len(fit.right_side)), fit.unknown.count
-    n = len(fit.X)
-    indices, end = list[np.ndarray](), n + n_c
-    for log, index in zip(fit.linear, fit.unknown.index, strict=True):
-        offsets = len(log.Z) - 2 - n - len(index)
-        own = np.r_[0:n, n + index, end : end + offsets]
-        end += offsets
-        indices.append(own)
+    slope = np.zeros(len(fit.right_side))
+    for log, own in zip(fit.linear, fit.indices, strict=True):
         slope[own] += log.Z[1:-1, -1]
     step = -np.linalg.solve(fit.information, slope)
     found, expected = 0.0, 0.0
-    for log, own, trajectory in zip(fit.linear, indices, fit.trajectories, strict=True):
+    for log, own, trajectory in zip(fit.linear, fit.indices, fit.trajectories, strict=True):
         multipliers = log.chain.response(np.concatenate([[0.0], step[own], [1.0]]))[1][1:]
         drawn = (log.gain.transpose(0, 2, 1) @ multipliers[:, :, None])[:, :, 0]
         error = np.concatenate([trajectory.torque_error, trajectory.force_error], axis=1)[:, log.acting] / log.noise

@@ -21,7 +21,6 @@ from excite.smoothing.log_fit import (
     covariance_in_si,
     linearise_logs,
     newton_step,
-    parameter_indices,
 )
 from excite.smoothing.measurements import Measurements, Trajectory, predict_readings
 
@@ -60,9 +59,7 @@ def quantify_uncertainty(
             space, measurements, fit.linear, fit.trajectories, fit.X, fit.prior, at_bounds
         )
     excess = np.zeros_like(covariance)
-    for data, trajectory, log, columns in zip(
-        measurements, fit.trajectories, fit.linear, parameter_indices(space, measurements), strict=True
-    ):
+    for data, trajectory, log, columns in zip(measurements, fit.trajectories, fit.linear, fit.indices, strict=True):
         encoder, white = encoder_error_moments(space, data, trajectory, fit.X, log)
         excess[np.ix_(columns, columns)] += encoder - white
     sandwich = covariance + covariance @ excess @ covariance
@@ -197,7 +194,7 @@ def profile_widths(
         trajectories = [
             apply_step(space, data, trajectory, log, distance * step[columns], X)
             for data, trajectory, log, columns in zip(
-                measurements, fit.trajectories, fit.linear, parameter_indices(space, measurements), strict=True
+                measurements, fit.trajectories, fit.linear, fit.indices, strict=True
             )
         ]
         linear = linearise_logs(space, measurements, trajectories, starts, X, fit.process_noise)
