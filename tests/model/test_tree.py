@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 
 from excite.model import Model, build, standard_parameters
 from excite.model.machine import Body, Machine, load_machine
+from excite.model.mechanics import round_angle
 
 STATES = 1000
 TOLERANCE = 1e-9
@@ -53,7 +54,8 @@ def random_tree(seed: int, joints: str, parents: tuple[int, ...]) -> Machine:
             "joint": kinds[letter],
             "inertia": random_inertia(rng),
         }
-        angles = {c: quantity(rng.uniform(-math.pi, math.pi)) for c in ("gamma", "alpha", "theta")}
+        # Rounded as the model rounds them, so that pinocchio has the same geometry.
+        angles = {c: quantity(round_angle(rng.uniform(-math.pi, math.pi))) for c in ("gamma", "alpha", "theta")}
         lengths = {c: quantity(rng.uniform(-1.0, 1.0)) for c in ("b", "d", "r")}
         row |= {c: v for c, v in (angles | lengths).items() if c not in replaced[letter]}
         if letter in "rp":
