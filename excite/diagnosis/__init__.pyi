@@ -17,7 +17,6 @@ from .residuals import (
     bin_means as bin_means,
     dependence_strength as dependence_strength,
     innovation_levels_over_time as innovation_levels_over_time,
-    refit_with_process_noise as refit_with_process_noise,
     residuals_of_logs as residuals_of_logs,
 )
 from .separating_run import RivalPair as RivalPair, rival_pairs as rival_pairs

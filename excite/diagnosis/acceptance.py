@@ -1,36 +1,13 @@
-"""Accept a finding that predicts withheld data, is significant beside slow unknown forces and has a possible sign."""
+"""Accept a finding that predicts withheld data, is significant and has a possible sign."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import numpy as np
-
-from excite.diagnosis.diagnosis import Finding, std_given_shapes
+from excite.diagnosis.diagnosis import Finding
 from excite.diagnosis.fits import ExtendedFit
 from excite.diagnosis.hold_out import HoldOutErrors, hold_out_gain, predictive_gain
-from excite.diagnosis.slow_forces import allow_slow_forces
 from excite.text import format_uncertain
 
 MIN_STDS = 2.0  # magnitude over its standard deviation given the shapes, of a finding; chosen
-
-
-def widen(finding: Finding, stage: ExtendedFit) -> Finding:
-    """Enlarge a magnitude's standard deviation to that beside slow unknown forces, if the fit leaves such."""
-    try:
-        beside = allow_slow_forces(stage)
-    except np.linalg.LinAlgError:
-        return finding
-    k = stage.model.base.names.index(finding.name)
-    shift, std = abs(beside.X[k] - stage.fit.X[k]), np.sqrt(beside.covariance[k, k])
-    if not np.isfinite(std) or stage.fit.unidentifiable[k]:
-        return finding
-    at_shapes = std_given_shapes(finding.name, stage.model, beside.covariance)
-    return replace(
-        finding,
-        magnitude_std=float(max(finding.magnitude_std, np.hypot(std, shift))),
-        std_at_shapes=float(max(finding.std_at_shapes, np.hypot(at_shapes, shift))),
-    )
 
 
 def reason_against(

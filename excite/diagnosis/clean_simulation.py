@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from excite import identification
-from excite.diagnosis.fits import RESUMED_DAMPING, RESUMED_PASSES, ExtendedFit
+from excite.diagnosis.fits import RESUMED, ExtendedFit
 from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.residuals import concentrations, residuals_of_logs
 from excite.errors import SimulationError
@@ -22,7 +22,6 @@ from excite.simulation import Motion
 from excite.smoothing import (
     ACCEPTABLE_STEP,
     Fit,
-    Settings,
     StateSpace,
     Trajectory,
     fit_logs,
@@ -61,13 +60,13 @@ class Remainder:
 
 def can_be_simulated(stage: ExtendedFit) -> bool:
     """Tell if a fit is one of exact dynamics, of which clean logs can be simulated: without friction that sticks."""
-    return stage.estimated and stage.exact and not stage.data.sticks
+    return stage.exact and not stage.data.sticks
 
 
 def measure_remainder(stage: ExtendedFit, runner: CallRunner = run_in_turn, seed: int = 0) -> Remainder | None:
     """Compare the misfit of a fit with that of clean logs of the fitted machine.
 
-    Return None where it cannot be told: process noise or inflated sensor noise absorbs a misfit, friction sticks, or
+    Return None where it cannot be told: unknown forces absorb a misfit, friction sticks, or
     the fitted machine cannot be simulated.
     """
     if not can_be_simulated(stage):
@@ -119,7 +118,7 @@ def _clean_squares(stage: ExtendedFit, seed: int) -> tuple[np.ndarray, np.ndarra
     except SimulationError:
         return None
     # Such a step changes the cost by about one.
-    settings = Settings(RESUMED_PASSES, RESUMED_DAMPING, tolerance=ACCEPTABLE_STEP)
+    settings = replace(RESUMED, tolerance=ACCEPTABLE_STEP)
     fit = fit_logs(space, measurements, true, X, starts, stage.data.held, settings=settings)
     return _sum_squares(fit) if fit.step <= ACCEPTABLE_STEP else None
 

@@ -14,16 +14,16 @@ import numpy as np
 import tomli_w
 
 from excite import identification, interrupt
-from excite.diagnosis import hold_out, residuals, separating_run, torque_regression
-from excite.diagnosis.acceptance import reason_against, widen
+from excite.diagnosis import hold_out, residuals, selection, separating_run, torque_regression
+from excite.diagnosis.acceptance import reason_against
 from excite.diagnosis.clean_simulation import Remainder, measure_remainder
 from excite.diagnosis.deadline import Deadline
-from excite.diagnosis.diagnosis import Diagnosis, Finding, NearestEffect, anomaly_lines, diagnose
-from excite.diagnosis.fits import ExtendedFit, with_true_sensor_noise
+from excite.diagnosis.diagnosis import Diagnosis, Finding, conclude, diagnose
+from excite.diagnosis.fits import ExtendedFit
 from excite.diagnosis.hold_out import HoldOutErrors, HoldOutGain
 from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.residuals import InnovationLevel
-from excite.diagnosis.selection import MIN_EXPLAINED_SHARE, ProgressCallback
+from excite.diagnosis.selection import ProgressCallback
 from excite.diagnosis.torque_regression import TorqueDiagnosis
 from excite.errors import NoEstimateError, NotIdentifiableError
 from excite.identification import Agreement
@@ -71,34 +71,29 @@ def assess(
 ) -> Assessment:
     """Measure hold-out gains, keep the findings that pay for their names, and locate the misfit.
 
-    The gain of a finding is that over the model with the findings before it. If nothing is named, effects that explain
-    too little to be causes are given as corrections, if they pay as well.
+    The gain of a finding is that over the model with all others. One that predicts withheld data no better is given up.
     """
     report, deadline = progress or (lambda share, what: None), deadline or Deadline()
-    entries = list(zip(d.findings, d.stages, strict=True)) or list(d.dropped)
-    entries = [(widen(f, stage), stage) for f, stage in entries]
-    stages = [d.before, *(stage for _, stage in entries)]
-    has_causes = any(f.kind == "cause" for f, _ in entries)  # only these are judged by their likelihood
-    shown = [hold_out.hold_out_torques(stage) for stage in stages]
-    held = _hold_out(stages, False, has_causes, runner, report) if has_causes or None in shown else shown
-    shown = held if None in shown else shown
-    reasons = _reasons_against(entries, held, shown)
-    if has_causes and any(reasons) and held[0] is not None and not deadline.is_over():
-        # withhold every part before a name is given up
-        reasons = _reasons_against(entries, _hold_out(stages, True, True, runner, report), shown)
-    count = next((k for k, reason in enumerate(reasons) if reason), len(entries))
-    d = _with_findings(d, entries[:count], reasons[count] if count < len(entries) else "")
-    gains = tuple(hold_out.hold_out_gain(a, b) for a, b in pairwise(shown[: 1 + count]))
-    total_gain = hold_out.hold_out_gain(shown[0], shown[count])
+    stages = [d.before, d.after, *(x for x in d.without if x is not None)] if d.findings else [d.before]
+    errors = _hold_out(stages, False, runner, report)
+    seen = [hold_out.hold_out_torques(x) if x.model.slips == () else None for x in stages[:2]]
+    shown = seen if d.findings and None not in seen else errors[:2]
+    beside = iter(errors[2:])
+    pairs = [(None if x is None else next(beside), errors[1]) for x in d.without]
+    reasons = [reason_against(f, d.after, *pair) for f, pair in zip(d.findings, pairs, strict=True)]
+    given_up = {f.name: reason for f, reason in zip(d.findings, reasons, strict=True) if reason}
+    if given_up:
+        return assess(_give_up(d, given_up, runner, deadline), progress, runner, deadline)
+    gains = tuple(hold_out.hold_out_gain(a, b) for a, b in pairs)
+    total_gain = hold_out.hold_out_gain(shown[0], shown[-1])
     before = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.before))
-    after = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.after)) if d.stages else before
+    after = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.after)) if d.findings else before
     located = d.located
     if d.verdict == "unexplained":  # replace lines of suspect sensors by located misfits
-        measured = with_true_sensor_noise(d.after)
-        other_lines = [line for line in d.located if line not in measured.suspect_sensors]
+        other_lines = [line for line in d.located if line not in d.after.suspect_sensors]
         located = (
             *other_lines[:FIRST_ANOMALY_LINES],
-            *residuals.locate_misfit(measured),
+            *residuals.locate_misfit(d.after),
             *other_lines[FIRST_ANOMALY_LINES:],
         )
     differs = d.verdict == "named" and not d.findings  # several logs, of which each alone is explained
@@ -129,67 +124,22 @@ def _with_remainder(d: Diagnosis, chi2: float) -> Diagnosis:
     return replace(d, share=factor * d.share, findings=tuple(replace(f, share=factor * f.share) for f in d.findings))
 
 
-Entry = tuple[Finding, ExtendedFit]
-
-
 def _hold_out(
-    stages: Sequence[ExtendedFit], every_turn: bool, likelihood: bool, runner: CallRunner, report: ProgressCallback
+    stages: Sequence[ExtendedFit], every_turn: bool, runner: CallRunner, report: ProgressCallback
 ) -> list[HoldOutErrors | None]:
     """Predict withheld stretches with each model, side by side."""
     done = list[HoldOutErrors | None]()
     report(0.0, "measuring the gain")
-    for errors in runner([partial(hold_out.hold_out_errors, s, every_turn, likelihood) for s in stages]):
+    for errors in runner([partial(hold_out.hold_out_errors, s, every_turn, True) for s in stages]):
         done.append(errors)
         report(len(done) / (len(stages) + 1), "measuring the gain")
     return done
 
 
-def _reasons_against(
-    entries: Sequence[Entry], held: Sequence[HoldOutErrors | None], shown: Sequence[HoldOutErrors | None]
-) -> list[str]:
-    """Say of each finding why it is not given. shown: hold-out errors that people see, by which corrections pay."""
-    return [
-        reason_against(f, s, *(pair if f.kind == "cause" else seen))
-        for (f, s), pair, seen in zip(entries, pairwise(held), pairwise(shown), strict=True)
-    ]
-
-
-def _with_findings(d: Diagnosis, entries: Sequence[Entry], reason: str) -> Diagnosis:
-    """Return the diagnosis with these findings only. reason: why the next one is not given, "" if all are."""
-    findings, stages = tuple(f for f, _ in entries), tuple(stage for _, stage in entries)
-    if stages == d.stages:
-        return replace(d, findings=findings)
-    if d.findings and not findings:  # back to the model without any
-        first = d.findings[0]
-        clean = d.before.exact and d.before.is_close and not anomaly_lines(d.before)
-        verdict = "clean" if clean else "unexplained"
-        nearest = None if clean else NearestEffect(first.name, first.share, (), reason)
-        return replace(
-            d,
-            verdict=verdict,
-            findings=(),
-            stages=(),
-            after=d.before,
-            share=1.0 if clean else 0.0,
-            nearest=nearest,
-            located=anomaly_lines(d.before),
-        )
-    after = stages[-1] if stages else d.before
-    share = sum(f.share for f in findings)
-    left = anomaly_lines(after)
-    told = "tied" if any(f.tied_with for f in findings) else "named" if findings else d.verdict
-    verdict = told if d.verdict != "unexplained" and (share >= MIN_EXPLAINED_SHARE or not left) else "unexplained"
-    kind = "correction" if verdict == "unexplained" else "cause"
-    return replace(
-        d,
-        verdict=verdict,
-        findings=tuple(replace(f, kind=kind) for f in findings),
-        stages=stages,
-        after=after,
-        share=share if findings else d.share,
-        located=left if findings else d.located,
-        nearest=None if findings else d.nearest,
-    )
+def _give_up(d: Diagnosis, reasons: Mapping[str, str], runner: CallRunner, deadline: Deadline) -> Diagnosis:
+    """Return the diagnosis without some findings, for these reasons."""
+    found = selection.give_up(d.before, d.after, reasons, runner, deadline)
+    return conclude(d.before, found, runner)
 
 
 def explain(
@@ -217,10 +167,9 @@ def explain(
             together,
             verdict=verdict,
             findings=(),
-            stages=(),
+            without=(),
             after=together.before,
             nearest=None,
-            dropped=(),
             located=(),
         )
         return replace(assess(plain, progress, runner), located=(), differences=differences)

@@ -16,18 +16,11 @@ import scipy.stats
 
 from excite import identification, smoothing
 from excite.diagnosis import selection
-from excite.diagnosis.fits import (
-    MIN_PROCESS_NOISE,
-    PROCESS_NOISE_LADDER,
-    RESUMED_DAMPING,
-    RESUMED_PASSES,
-    SUFFICIENT_STEP,
-    ExtendedFit,
-)
+from excite.diagnosis.fits import RESUMED, ExtendedFit
 from excite.logs import filtered_regression
 from excite.model import build
 from excite.model.machine import Machine
-from excite.smoothing import PROCESS_NOISE_LEVELS, Fit, predict_readings
+from excite.smoothing import Fit, NotConvergedError, predict_readings
 
 STRETCH_S = 2.0  # length of a withheld stretch [s]; chosen
 WANTED_STRETCHES = 20  # number of stretches; chosen
@@ -37,7 +30,6 @@ BOOTSTRAP_DRAWS = 2000  # chosen
 
 
 OF_STRETCHES = "squares", "counts", "turn", "log_likelihood"  # fields with a row for each stretch
-LIKELIHOOD_LEVELS = 0.0, *PROCESS_NOISE_LADDER  # of process noise, the best of which a wrong model may have
 
 
 @dataclass(frozen=True)
@@ -47,8 +39,7 @@ class HoldOutErrors:
     sensors (m): names and units. squares (stretches, m) [SI squared]: sums of squared errors. counts (stretches, m):
     number of readings. signal_variance (m,): mean variance of a signal within a stretch. noise_variance (m,): variance
     of a reading. turn (stretches,): stretches of one turn are hidden at once. log_likelihood (stretches,): of the
-    readings of a stretch given all before them, with the parameters of the rest, by level of process noise
-    (stretches, LIKELIHOOD_LEVELS); NaN if there is none or it was not asked for.
+    readings of a stretch given all before them, with the parameters of the rest; NaN if it was not asked for.
     """
 
     sensors: tuple[tuple[str, str], ...]
@@ -106,11 +97,10 @@ def hold_out_errors(stage: ExtendedFit, every_turn: bool = False, likelihood: bo
     """Predict withheld stretches of a fit's logs with its model.
 
     every_turn: withhold every part of the logs once, not WANTED_STRETCHES only. likelihood: find `log_likelihood`, too.
-    The machine file's parameters are used if none were estimated. Return None if no fit to the rest is found or the
-    logs are too short.
+    Return None if no fit to the rest is found or the logs are too short.
     """
     data, fit = stage.data, stage.fit
-    held = data.held | fit.unidentifiable if stage.estimated or data.noise_inflation > 1 else np.ones_like(data.held)
+    held = data.held | fit.unidentifiable
     rate = float(stage.machine.sampling_hz)
     lengths = [len(r.used) for r in data.measurements]
     per_turn = sum(len(_stretches(n, rate)) for n in lengths)
@@ -171,7 +161,7 @@ def hold_out_torques(stage: ExtendedFit) -> HoldOutErrors | None:
     if not squares:
         return None
     names = torque_names(machine)
-    likelihood = np.full((len(squares), 1), np.nan)
+    likelihood = np.full(len(squares), np.nan)
     return HoldOutErrors(
         names, np.array(squares), np.array(counts), np.mean(motion, axis=0), level**2, np.array(turns), likelihood
     )
@@ -191,24 +181,18 @@ def _errors_of_turn(
     """Hide some stretches of each log at once, and predict them; None if no fit to the rest is found."""
     data, fit = stage.data, stage.fit
     space, masked = data.space, []
-    for r, own in zip(data.measurements, stretches, strict=True):
+    for r, own in zip(stage.measurements, stretches, strict=True):
         used = r.used.copy()
         for a, b in own:
             used[a:b] = 0.0
         masked.append(replace(r, used=used))
-    rest: Fit | None = None
-    levels = MIN_PROCESS_NOISE, *PROCESS_NOISE_LEVELS[:-1]  # for a wrong model without a fit to the rest
-    for process_noise in (fit.process_noise, *(x for x in levels if x > fit.process_noise)):
-        # A prediction needs no accurate covariance.
-        tolerance = smoothing.ACCEPTABLE_STEP if process_noise > 0 else SUFFICIENT_STEP
-        settings = smoothing.Settings(RESUMED_PASSES, RESUMED_DAMPING, tolerance=tolerance)
-        rest = smoothing.fit_logs(space, masked, fit.trajectories, fit.X, data.starts, held, process_noise, settings)
-        if rest.step <= smoothing.ACCEPTABLE_STEP:
-            break
-    if rest is None or rest.step > smoothing.ACCEPTABLE_STEP:
+    rest = smoothing.fit_logs(
+        space, masked, fit.trajectories, fit.X, data.starts, held, settings=RESUMED, unknown=fit.unknown
+    )
+    if rest.step > smoothing.ACCEPTABLE_STEP:
         return None
     squares, counts, motion, noise = [], [], [], []
-    for r, p, own in zip(data.measurements, rest.trajectories, stretches, strict=True):
+    for r, p, own in zip(stage.measurements, rest.trajectories, stretches, strict=True):
         u = space.delivered_torques(r.torque, rest.X)[0] + p.sampled_torque_error
         h, _, weight, *_ = predict_readings(space, r, p, u, rest.X)
         noise.append(r.used.sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300))
@@ -226,42 +210,33 @@ def _errors_of_turn(
         np.mean(motion, axis=0),
         np.mean(noise, axis=0),
         np.full(len(squares), turn),
-        _likelihood_of_stretches(stage, rest, stretches, LIKELIHOOD_LEVELS if likelihood else ()),
+        _likelihood_of_stretches(stage, rest, stretches) if likelihood else np.full(len(squares), np.nan),
     )
 
 
 def _likelihood_of_stretches(
-    stage: ExtendedFit, rest: Fit, stretches: Sequence[Sequence[tuple[int, int]]], levels: Sequence[float]
+    stage: ExtendedFit, rest: Fit, stretches: Sequence[Sequence[tuple[int, int]]]
 ) -> np.ndarray:
-    """Return the log-likelihood (stretches, LIKELIHOOD_LEVELS) with the parameters of a fit, NaN where not found.
+    """Return the log-likelihood (stretches,) with the parameters of a fit, NaN where not found.
 
-    levels: of process noise, the first of LIKELIHOOD_LEVELS, found as long as the likelihood grows with them. Every
-    reading counts given those before it, by the innovations of a filter along all readings. Friction that builds up
-    over a small angle is linearised where the whole logs lead, as the rest alone leads too far off. A model that
-    explains the logs has no process noise.
+    Every reading counts given those before it, by the innovations of a filter along all readings. Friction that builds
+    up over a small angle is linearised where the whole logs lead, as the rest alone leads too far off.
     """
-    data = stage.data
     along: Sequence[smoothing.Trajectory] = rest.trajectories
     if any(e.unsticking for e in stage.model.effects):
         along = [replace(p, offset=r.offset) for p, r in zip(stage.fit.trajectories, along, strict=True)]
-    found = np.full((sum(len(own) for own in stretches), len(LIKELIHOOD_LEVELS)), np.nan)
-    for k, level in enumerate(levels):
-        if level > 0 and rest.process_noise == 0 and stage.is_close:
-            break
-        linear = smoothing.linearise_logs(data.space, data.measurements, along, data.starts, rest.X, level)
-        if linear is None:
-            continue
-        likelihood = []
-        for x, own in zip(linear, stretches, strict=True):
-            variance = np.ones_like(x.residual)
-            for step in x.filter:
-                variance[step.samples] = step.variance
-            each = -0.5 * (x.innovations**2 + np.log(variance))
-            likelihood += [float(np.nansum(each[a:b])) for a, b in own]
-        found[:, k] = likelihood
-        if k and found[:, k].sum() < found[:, k - 1].sum():
-            break
-    return found
+    try:
+        linear = replace(stage, fit=replace(rest, trajectories=tuple(along))).relinearised.linear
+    except NotConvergedError:
+        return np.full(sum(len(own) for own in stretches), np.nan)
+    found = []
+    for x, own in zip(linear, stretches, strict=True):
+        variance = np.ones_like(x.residual)
+        for step in x.filter:
+            variance[step.samples] = step.variance
+        each = -0.5 * (x.innovations**2 + np.log(variance))
+        found += [float(np.nansum(each[a:b])) for a, b in own]
+    return np.array(found)
 
 
 def hold_out_gain(before: HoldOutErrors | None, after: HoldOutErrors | None, seed: int = 0) -> HoldOutGain | None:
@@ -310,7 +285,7 @@ def predictive_gain(
     if before is None or after is None:
         return None
     common = np.intersect1d(before.turn, after.turn)
-    each = _at_best_level(after.of(common)) - _at_best_level(before.of(common))
+    each = after.of(common).log_likelihood - before.of(common).log_likelihood
     each = each[np.isfinite(each)]
     n = len(each)
     if n < 2:
@@ -321,13 +296,6 @@ def predictive_gain(
     else:
         std, quantile = np.sqrt(n) * float(each.std(ddof=1)), float(scipy.stats.t.ppf(0.975, n - 1))
     return PredictiveGain(total, total - quantile * std)
-
-
-def _at_best_level(errors: HoldOutErrors) -> np.ndarray:
-    """Return the log-likelihood (stretches,) with the process noise that suits a model best."""
-    total = errors.log_likelihood.sum(axis=0)
-    best = int(np.nanargmax(total)) if np.isfinite(total).any() else 0
-    return errors.log_likelihood[:, best]
 
 
 def _stretches(samples: int, rate: float, shift: float = 0.0) -> Sequence[tuple[int, int]]:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from excite.diagnosis import selection
-from excite.diagnosis.fits import ExtendedFit, RefitRequest, refit_all
+from excite.diagnosis.fits import ExtendedFit, refit_all
 from excite.diagnosis.parallel import CallRunner
 from excite.model import effects
 from excite.model.effects import PlacedEffect, Site
@@ -32,7 +32,7 @@ def std_over_weak_shapes(placed: PlacedEffect, after: ExtendedFit, runner: CallR
     determined = ~fit.unidentifiable & (fit.std < WEAK_SHAPE_RATIO * prior_std)
     entry = selection.fitted_entry(after, placed.name)
     own = [placed.name, *(f"{placed.name}.{s}" for s in placed.shapes)]
-    requests: list[RefitRequest] = []
+    machines: list[Machine] = []
     held: list[str] = []
     for s in placed.shapes:
         if (name := f"{placed.name}.{s}") not in names or determined[k := names.index(name)]:
@@ -41,15 +41,11 @@ def std_over_weak_shapes(placed: PlacedEffect, after: ExtendedFit, runner: CallR
             for x in ((fit.X[k] + end) / 2, end) if end != fit.X[k] else ():
                 value = Quantity(value=float(x), source="assumed")
                 other = entry.model_copy(update={"shape": {**entry.shape, s: value}})
-                machine = effects.with_effects(effects.without_effect(after.machine, placed.name), other)
-                requests.append((machine, after, fit.process_noise))
+                machines.append(effects.with_effects(effects.without_effect(after.machine, placed.name), other))
                 held.append(name)
-    cost_limit = fit.cost + ACCEPTED_COST_STDS**2 * after.dispersion
     data_cost_limit = _cost_of_data(after, own) + ACCEPTED_COST_STDS**2 * after.dispersion
     found = [
-        x
-        for x in refit_all(requests, runner, cost_limit, held)
-        if x is not None and _cost_of_data(x, own) < data_cost_limit
+        x for x in refit_all(machines, after, runner, held) if x is not None and _cost_of_data(x, own) < data_cost_limit
     ]
     magnitudes = [x.fit.X[x.model.base.names.index(placed.name)] for x in found]
     return max((abs(float(a - fit.X[names.index(placed.name)])) / ACCEPTED_COST_STDS for a in magnitudes), default=0.0)

@@ -13,11 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from excite.diagnosis.fits import ExtendedFit, refit_all, with_true_sensor_noise
-from excite.diagnosis.parallel import run_in_turn
+from excite.diagnosis.fits import ExtendedFit
 from excite.diagnosis.residual_tests import MIN_SYSTEMATIC_MEAN_SQUARE, TONE_MARGIN
 from excite.diagnosis.spectrum import strongest_line
-from excite.smoothing import PROCESS_NOISE_LEVELS, LinearisedLog, differentiate, integrate, state_scale
+from excite.smoothing import SLOPES, LinearisedLog
 from excite.text import format_number
 
 BLOCK_S = 0.25  # length of a block [s] whose mean is the slow error; chosen
@@ -82,20 +81,8 @@ class InnovationLevel:
         return 100 * (1 - 1 / worst) if worst > MIN_SYSTEMATIC_MEAN_SQUARE else 0.0
 
 
-def refit_with_process_noise(stage: ExtendedFit) -> ExtendedFit:
-    """Refit the same model with process noise of at least the first level, if there is such a fit."""
-    least, known = PROCESS_NOISE_LEVELS[0], stage
-    while known.fit.process_noise < least or known.data.noise_inflation > 1:
-        if known.process_noise_fit is None:
-            (found,) = refit_all([(stage.machine, stage, least)], run_in_turn)
-            return found or stage
-        known = known.process_noise_fit
-    return known
-
-
 def residuals_of_logs(stage: ExtendedFit) -> tuple[LogResiduals, ...]:
-    """Return the residuals of each log of a fit, with the true sensor noise."""
-    stage = with_true_sensor_noise(stage)
+    """Return the residuals of each log of a fit."""
     return tuple(_residuals_of_log(stage, k) for k in range(len(stage.data.logs)))
 
 
@@ -115,9 +102,9 @@ def _residuals_of_log(stage: ExtendedFit, k: int) -> LogResiduals:
         missing[label] = w[:, j], "N m" if body.joint == "revolute" else "N", float(r.noise.torque[j])
         body_of[label] = body.index
     if not stage.exact:
-        for label, force, unit, index in _process_forces(stage, p.state, space.inputs(u, p.ground_inputs)):
+        for label, force, unit, index in _unknown_forces(stage, k, w.shape[1]):
             before = missing.get(label)
-            # A force on a driven joint adds to its missing torque.
+            # An unknown torque of a driven joint adds to its torque error.
             missing[label] = (before[0] + force, unit, float("nan")) if before else (force, unit, float("nan"))
             body_of.setdefault(label, index)
     return LogResiduals(
@@ -130,35 +117,27 @@ def _residuals_of_log(stage: ExtendedFit, k: int) -> LogResiduals:
     )
 
 
-def _process_forces(stage: ExtendedFit, s: np.ndarray, u: np.ndarray) -> list[tuple[str, np.ndarray, str, int | None]]:
-    """Return the smoothed process forces along states s (N, n) under inputs u (N, n_inputs).
-
-    Each comes as label, values (N,), unit, and driven body or None.
-    """
-    space, X, model = stage.data.space, stage.fit.X, stage.model
-    steps = integrate(space, s, u[:-1], u[1:], X)
-    defect = (s[1:] - steps.end) / state_scale(space)
-    F = np.nan_to_num(differentiate(space, steps, X, force=True).F) / state_scale(space)[:, None]
-    square = F.transpose(0, 2, 1) @ F
-    square += 1e-12 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(F.shape[2])
-    force = np.linalg.solve(square, F.transpose(0, 2, 1) @ np.nan_to_num(defect)[:, :, None])[:, :, 0]
-    force = np.concatenate([force, force[-1:]])
-    names = {0: ("force ahead", "N"), 1: ("force to the left", "N"), 2: ("yaw moment", "N m")}
-    root = stage.machine.body[0].coordinates
+def _unknown_forces(stage: ExtendedFit, k: int, n_u: int) -> list[tuple[str, np.ndarray, str, int | None]]:
+    """Return what is fitted beside the model along log k: label, values (N,), unit, and the body or None."""
+    space, model, p = stage.data.space, stage.model, stage.fit.trajectories[k]
+    features = space.features(p.state)[0][:, :, 0]
+    forces = stage.fit.unknown.lacking[k].added_inputs(p.lacking, features, space.n_inputs)
+    first = space.n_inputs - len(space.forces)
+    if p.force_error is not None:
+        forces[:, first:] += np.concatenate([p.force_error, p.force_error[-1:]])
     found: list[tuple[str, np.ndarray, str, int | None]] = []
-    for j, row in enumerate(space.forced_rows):
-        coordinate = model.coordinates[row]
-        if stage.machine.planar and coordinate in root:
-            label, unit = names[root.index(coordinate)]
-            found.append((label, force[:, j], unit, None))
-            continue
-        body = next(b for b in stage.machine.body if coordinate in b.coordinates)
+    for j, (name, body) in enumerate(zip(model.inputs, stage.machine.actuated, strict=True)):
         turns = body.joint == "revolute"
-        number = model.actuated.index(row) if row in model.actuated else None
-        name = f" {model.inputs[number]}" if number is not None else ""
-        label = f"{'torque' if turns else 'force'}{name}, {body.where.replace('_', ' ')}"
-        found.append((label, force[:, j], "N m" if turns else "N", body.index))
-    return found
+        label = f"{'torque' if turns else 'force'} {name}, {body.where.replace('_', ' ')}"
+        found.append((label, forces[:, j], "N m" if turns else "N", body.index))
+    bodies = {b.index: b for b in stage.machine.body}
+    for j, (index, kind) in enumerate(space.forces):
+        if kind in SLOPES:
+            found.append((f"slope {kind}", forces[:, first + j], "m/s2", None))
+        else:
+            label = f"{kind} {'moment' if kind == 'turning' else 'force'}, {bodies[index].where.replace('_', ' ')}"
+            found.append((label, forces[:, first + j], "N m" if kind == "turning" else "N", index))
+    return [x for x in found if x[1].any()]
 
 
 def _quantities(

@@ -10,14 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import product
 
 import casadi as ca
 import numpy as np
 
 from excite import smoothing
-from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.logs import implicit, passes
 from excite.model import SignatureFunctions, effects, signatures
 from excite.model.effects import CATALOGUE, Effect, PlacedEffect, Site
@@ -26,6 +24,7 @@ from excite.simulation import delivered_torque
 from excite.smoothing import (
     BATCH_SIZE,
     BatchedFunction,
+    Lacking,
     LinearisedLog,
     Measurements,
     StateSpace,
@@ -40,9 +39,7 @@ from excite.smoothing import (
 
 NEARBY_MAGNITUDES = 0.6, 0.8, 1.0, 1.3, 1.7  # factors on a magnitude that does not scale its signature; chosen
 REFINEMENT_POINTS = -2, -1, 0, 1, 2  # thirds of the way to the trial values before and after; chosen
-MIN_COLUMNS_TO_SPLIT = 100  # columns from which a second process pays; chosen
 UNBOUNDED_SIGNATURE = 1e9  # in units of a state's or reading's scale, from which a signature has no bounds; chosen
-MIN_UNABSORBED_SHARE = 1e-5  # share of a signature below which only errors of single precision are left
 MIN_SIGNATURE = 1e-6  # squared norm of a whitened signature below which the logs do not show it; chosen
 MIN_PHASE_SHARE = 1e-9  # squared norm of a sine over its cosine's, or the reverse, below which it is left out; chosen
 
@@ -207,7 +204,8 @@ class FittedLog:
 
     origins: number of unknown encoder offsets. q, nu, a (N, n_q): motion and accelerations. u (N, n_u): delivered
     torques. t (N,) [s]. exact (N, n_readings): readings without noise. standard: standard parameters. slopes: see
-    `_input_sensitivities`. white: whitened innovations. over (N, n_over): values of the map of the ground.
+    `_input_sensitivities`. white: whitened innovations. over (N, n_over): values of the map of the ground. by_input
+    (N - 1, n, n_e): as `slopes`, by half of each input at both ends.
     """
 
     space: StateSpace
@@ -223,6 +221,8 @@ class FittedLog:
     slopes: np.ndarray
     white: WhitenedInnovations
     over: np.ndarray
+    trajectory: Trajectory
+    by_input: np.ndarray
 
 
 def fitted_logs(space: StateSpace, measurements: Sequence[Measurements], fit: smoothing.Fit) -> tuple[FittedLog, ...]:
@@ -243,10 +243,36 @@ def _fitted_log(space: StateSpace, r: Measurements, p: Trajectory, linear: Linea
         if 2 * n_q <= at < 2 * n_q + wheels.shape[1]:
             wheels[:, at - 2 * n_q] = p.state[:, k]
     exact = model.read(q.T, nu.T, wheels.T, u.T, z.T, X).full().T
-    slopes, white = _input_sensitivities(space, p, u, X), whiten(linear)
+    slopes, by_input = _input_sensitivities(space, p, u, X)
+    white = whiten(linear)
     at = model.true_coordinates(q, X)
     over = p.ground_inputs if model.map_inputs else passes(model, at, nu, 1 / float(model.machine.sampling_hz))
-    return FittedLog(space, linear, len(r.offset_sensors), q, nu, a, u, t, exact, model.expand @ X, slopes, white, over)
+    standard = model.expand @ X
+    return FittedLog(
+        space, linear, len(r.offset_sensors), q, nu, a, u, t, exact, standard, slopes, white, over, p, by_input
+    )
+
+
+def beside(fitted_log: FittedLog, lacking: Lacking) -> FittedLog:
+    """Return a fitted log with a further column of its whitened innovations for each coefficient of what is lacking."""
+    if not lacking.count:
+        return fitted_log
+    space, linear, white = fitted_log.space, fitted_log.linear, fitted_log.white
+    features = space.features(fitted_log.trajectory.state)[0][:, :, 0]
+    place = list(space.input_columns).index
+    shapes = [(t.columns, place(t.at), t.values(features).astype(np.float32)) for t in lacking.inputs]
+
+    def along(at: slice) -> tuple[np.ndarray, np.ndarray]:
+        K = at.stop - at.start
+        push = np.zeros((K, space.n, lacking.count), np.float32)
+        for columns, j, shape in shapes:
+            both = shape[at.start : at.stop + 1]
+            ends = both[:-1] + both[1:]
+            push[: len(ends), :, columns] += fitted_log.by_input[at][:, :, j, None] * ends[:, None]
+        return push, np.zeros((K, linear.H.shape[1], lacking.count), np.float32)
+
+    more = np.concatenate([E for _, E in whiten_signatures(linear, white, along)])
+    return replace(fitted_log, white=replace(white, E=np.concatenate([white.E, more], axis=2)))
 
 
 class SignatureColumns:
@@ -323,10 +349,12 @@ def _unactuated_rows(space: StateSpace) -> list[int]:
     return [k for k, row in enumerate(space.forced_rows) if row not in space.model.actuated]
 
 
-def _input_sensitivities(space: StateSpace, p: Trajectory, u: np.ndarray, X: np.ndarray) -> np.ndarray:
-    """Return the effect of half a torque or force at both ends of each interval on the state after it.
+def _input_sensitivities(
+    space: StateSpace, p: Trajectory, u: np.ndarray, X: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the effect of half a torque or force at both ends of each interval on the state after it, scaled.
 
-    Shape (N - 1, n, n_u + n_free), scaled states: torques, then forces on rows without an actuator.
+    Shapes (N - 1, n, n_u + n_free): torques, then forces on rows without an actuator; (N - 1, n, n_e): all inputs.
     """
     N, scale, free, inputs = (
         len(p.state),
@@ -335,12 +363,14 @@ def _input_sensitivities(space: StateSpace, p: Trajectory, u: np.ndarray, X: np.
         space.inputs(u, p.ground_inputs),
     )
     found = np.empty((N - 1, space.n, u.shape[1] + len(free)), np.float32)
+    every = np.empty((N - 1, space.n, len(space.input_columns)), np.float32)
     for at in range(0, N - 1, BATCH_SIZE):
         until = min(at + BATCH_SIZE, N - 1)
         steps = integrate(space, p.state[at : until + 1], inputs[at:until], inputs[at + 1 : until + 1], X)
         by = differentiate(space, steps, X, force=True)
-        found[at:until] = np.concatenate([by.B, by.F[:, :, free]], axis=2) / (2 * scale[:, None])
-    return found
+        found[at:until] = np.concatenate([by.B[:, :, : u.shape[1]], by.F[:, :, free]], axis=2) / (2 * scale[:, None])
+        every[at:until] = by.B / (2 * scale[:, None])
+    return found, every
 
 
 def _order_forces(space: StateSpace, force: np.ndarray) -> np.ndarray:
@@ -381,74 +411,3 @@ def integrate_memory(
     flow = ca.Function("flow", [z, at], [rate])
     along = np.hstack([q, nu, u, t[:, None]])
     return implicit(flow, np.zeros(n_z), along, float(t[1] - t[0]), over[:, : functions.n_map_inputs])
-
-
-def score_candidates(
-    along: Sequence[FittedLog], fit: smoothing.Fit, found: Sequence[Candidate], runner: CallRunner = run_in_turn
-) -> tuple[Score, ...]:
-    """Score every candidate along fitted logs, best first."""
-    ends = np.cumsum([len(x.columns) for x in found])
-    middle = int(np.searchsorted(ends, ends[-1] / 2)) if len(found) and ends[-1] > MIN_COLUMNS_TO_SPLIT else 0
-    parts = [part for part in (found[:middle], found[middle:]) if part]
-    answers = runner([partial(_score_values, along, fit, renumber_columns(part)) for part in parts])
-    every = zip(found, (x for part in answers for x in part), strict=True)
-    scores = [Score(x, *values) for x, values in every if values is not None]
-    return tuple(sorted(scores, key=lambda s: -s.likelihood_ratio))
-
-
-ScoreValues = tuple[float, dict[str, float], float]  # likelihood ratio, values and unabsorbed share of a score
-
-
-def without_offsets(form: np.ndarray, n: int, n_offsets: int) -> np.ndarray:
-    """Marginalise the encoder offsets, which belong to one log, behind data and n parameters in a quadratic form."""
-    o, keep = slice(1 + n, 1 + n + n_offsets), np.r_[0 : 1 + n, 1 + n + n_offsets : len(form)]
-    inner = form[o, o] + np.eye(n_offsets)
-    return np.asarray(form[np.ix_(keep, keep)] - form[keep, o] @ np.linalg.solve(inner, form[o, keep]))
-
-
-def _score_values(
-    along: Sequence[FittedLog], fit: smoothing.Fit, found: Sequence[Candidate]
-) -> list[ScoreValues | None]:
-    """Return the score of each candidate beside the parameters alone; None if nothing shows it."""
-    total, n = sum(len(x.columns) for x in found), len(fit.X)
-    Z = np.zeros((1 + n + total, 1 + n + total))
-    for fitted_log in along:
-        Z += without_offsets(SignatureColumns(fitted_log, found).products(), n, fitted_log.n_offsets)
-    own, p = slice(1 + n, None), slice(1, 1 + n)
-    prior, slope, _ = smoothing.prior_terms(along[0].space.model, fit.prior, fit.X)
-    information, cross, gradient = Z[p, p] + prior, Z[p, own], Z[p, 0] + slope
-    solved = np.linalg.solve(information, np.column_stack([cross, gradient]))
-    S = Z[own, own] - cross.T @ solved[:, :-1]
-    g = Z[own, 0] - cross.T @ solved[:, -1]
-    return [_score(x, S, g, Z[own, own]) for x in found]
-
-
-def _score(x: Candidate, S: np.ndarray, g: np.ndarray, own: np.ndarray) -> ScoreValues | None:
-    """Score one candidate; None if the parameters absorb its signature or the logs do not show it."""
-    size = np.diag(own)[list(x.columns)]
-    if not (np.isfinite(size).all() and size.max() >= MIN_SIGNATURE):
-        return None
-    # Leave out a sine or cosine without effect, such as a slope across a straight lane.
-    shown = size > MIN_PHASE_SHARE * size.max()
-    at = [k for k, is_shown in zip(x.columns, shown, strict=True) if is_shown]
-    unabsorbed = float(np.min(np.diag(S)[at] / np.diag(own)[at]))
-    if not unabsorbed > MIN_UNABSORBED_SHARE:
-        return None
-    step = np.zeros(len(shown))
-    step[shown] = -np.linalg.solve(S[np.ix_(at, at)] + 1e-9 * np.diag(np.diag(own)[at]), g[at])
-    values, effect = dict(x.placed.values), x.placed.effect
-    if len(shown) == 2:
-        circular = next(n for n, s in effect.shapes.items() if s.circular)
-        values[circular] = float(np.arctan2(step[1], step[0]))
-        values["A"] *= float(np.hypot(*step))
-    else:
-        values["A"] *= float(step[0])
-    # If negative magnitudes are tried, a step back from a positive one belongs to those.
-    is_forward = effect.positive or min(effect.grid) < 0
-    if is_forward and step[0] <= 0 and len(shown) == 1:
-        return 0.0, values, unabsorbed
-    ratio, beyond = float(-step[shown] @ g[at]), abs(values["A"]) / effect.largest
-    if beyond > 1:  # the gain at the largest magnitude that is possible
-        values["A"] /= beyond
-        ratio *= (2 - 1 / beyond) / beyond
-    return ratio, values, unabsorbed

@@ -1,80 +1,43 @@
-"""Choose one further effect for a model, with the rivals that explain the logs about as well.
+"""Find the effects that explain logs: forward by evidence, then backward and by exchange with refits.
 
-Candidates are scored to first order, the likeliest are fitted, and the best fit is chosen. If no model tracks the logs,
-the first effect, or a pair, is chosen with inflated sensor noise (`choose_with_inflated_noise`) or by fits from initial
-trajectories (`choose_from_start`).
-
-Likelihood ratio means 2 delta log L, the decrease of the deviance.
+Candidates compete beside unknown forces (`evidence`). Those chosen become part of the model, which is fitted again, and
+so on until none gains. Then each effect is removed in turn, and exchanged for its likeliest rivals.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.stats
 
-from excite.diagnosis import score_test
+from excite.diagnosis import evidence, score_test
 from excite.diagnosis.deadline import Deadline
-from excite.diagnosis.fits import (
-    IMPOSSIBLE_SIGN_STDS,
-    LOST_COST_RATIO,
-    MIN_PROCESS_NOISE,
-    TRACKING_COST_RATIO,
-    ExtendedFit,
-    RefitRequest,
-    drop_process_noise,
-    fit_all_from_start,
-    refit,
-    refit_all,
-    resume_with_true_sensor_noise,
-)
+from excite.diagnosis.evidence import Chosen
+from excite.diagnosis.fits import IMPOSSIBLE_SIGN_STDS, ExtendedFit, refit, refit_all
 from excite.diagnosis.parallel import CallRunner
 from excite.diagnosis.residual_tests import is_shaking
-from excite.logs import Log
+from excite.diagnosis.score_test import Candidate
 from excite.model import effects
-from excite.model.effects import Effect, PlacedEffect
+from excite.model.effects import PlacedEffect
 from excite.model.machine import EffectEntry, Machine, Quantity
-from excite.smoothing import PROCESS_NOISE_LEVELS, NotConvergedError
+from excite.smoothing import NotConvergedError
 
 # Significance. Logs without any effect stay below a likelihood ratio of 16. By chi-squared and Bonferroni, at most
 # 2.1 % of logs of a minute exceed the required ratio (371 candidates of va12 with all shapes), 2.7 % of longer (441).
 MIN_LIKELIHOOD_RATIO = 22.0  # calibrated on logs without effects
 MAX_P_VALUE = 0.05  # of an effect, which for many shapes requires more than MIN_LIKELIHOOD_RATIO; chosen
-
-# Candidates that are fitted. Pairs of numbers hold for exact dynamics close to the logs, and otherwise.
-MIN_SCORE = 15.0  # first-order likelihood ratio; chosen
-MIN_SCORE_SHARE = 0.4, 0.15  # share of the best score; chosen
-MAX_CANDIDATES = 5  # number of candidates, beside further variants of the likeliest names; chosen
-VARIANT_SCORE_SHARE = 0.7  # share of the best score of its name at which a variant is fitted, too; chosen
-PLAIN_VARIANT_SCORE_SHARE = 0.5  # the same for the variant without signed shapes, which others may mimic; chosen
-RESTART_SCORE_SHARE = 0.9  # share of the best score from which a candidate without a fit is fitted anew; chosen
-CANDIDATE_PROGRESS_SHARE = 0.5  # share of the required gain that is asked of the first passes of a fit; chosen
-FIRST_BATCH = 2  # candidates that are fitted before others are compared with them; chosen
-MAX_RATIO_OVER_SCORE = 2.5  # largest likelihood ratio of a fit over the candidate's score; chosen
+MAX_EFFECTS = 8  # number of effects beside presliding; chosen
+MAX_TURNS = 8  # of choosing and fitting again; chosen
+FORMULA_ERROR = 0.03  # relative difference of two formulas of one effect: 1 to 6 % in results/diagnosis
+MAX_FORMULA_RATIO = 250.0  # largest likelihood ratio that the error of a formula makes; chosen
+# Of an effect's gain, that another in its place may lose to first order to be fitted there; chosen.
+RIVAL_LOSS, RIVAL_LOSS_SHARE = 20.0, 0.15
+MAX_RIVALS = 3  # that are fitted in the place of an effect; chosen
 REFINEMENT_REACHES = 1.0, 0.35  # shares of the way to the next trial values, refined in turn; chosen
 TIME_TRIAL_SHARE = 12  # duration over the distance of refined trial instants: a grid of quarters, in thirds
 INSTANT_ACCURACY_S = 0.5  # [s] to which instants are refined, as fits find them only from nearby; chosen
-
-# Effects that are worth a place: share of the excess cost that they must explain.
-MIN_EXCESS_SHARE = 0.05, 0.15  # for exact dynamics close to the logs, and otherwise; chosen
-MIN_EXCESS_SHARE_OF_FIRST = 0.3  # of the first effect, or far from the logs: the largest of three; chosen
-MIN_EXPLAINED_SHARE = 0.85  # of the excess misfit, for a name; right causes in results/diagnosis explain 0.85 or more
-LARGE_EXCESS_RATIO = 0.01  # excess over expected cost that no error of a formula removes entirely; chosen
-
-# Nature is never exactly the formula: what is left of an effect may be another effect's gain.
-FORMULA_ERROR = 0.03  # relative difference of two formulas of one effect: 1 to 6 % in results/diagnosis
-MAX_FORMULA_RATIO = 250.0  # largest likelihood ratio that the error of a formula makes; chosen
-MAX_FORMULA_SHARE = 0.1  # largest share of an effect's gain that the error of its formula takes; chosen
-MIN_GAIN_SHARE_WITH_NOISE = 0.25  # share to exceed where process noise hides how good the formulas are; chosen
-
-# Ties: by how much a rival may be worse.
-TIE_LIKELIHOOD_RATIO = 10.0  # likelihood ratio; chosen
-TIE_EXCESS_SHARE = 0.3  # share of the excess cost that the best effect leaves; chosen
-TIE_GAIN_SHARE_WITH_NOISE = 0.02  # share of the gain with process noise, which absorbs differences; chosen
-
 TRANSITION = "friction_transition"  # has no meaning where friction near rest is free
 PRESLIDING = "presliding"  # what friction near rest is if it is not free
 MIN_MAGNITUDE_STDS = 0.3  # standard deviations from zero below which a positive magnitude fell to zero; chosen
@@ -82,133 +45,170 @@ MAX_SIGNATURE_STEP = 2.0  # factor on a trial magnitude up to which its signatur
 MIN_SIGNATURE_STEP = 0.3  # the same downwards; chosen
 SMALLEST_VALUE = 1e-12  # magnitude or shape in a machine file below which it is zero; rounding
 ProgressCallback = Callable[[float, str], None]  # called with the share done and the next step
-_Trial = tuple[score_test.Score, ExtendedFit]
 
 
 @dataclass(frozen=True)
 class Choice:
-    """An effect that was added, the model with it, and its rivals.
+    """An effect of the final model.
 
-    likelihood_ratio: over the model without it (Wald's statistic if that could not be fitted). dispersion: factor by
-        which the remaining misfit reduces its significance. n_candidates: number of candidates that were scored.
-    unabsorbed_share: share of the effect that parameters do not absorb.
-    process_noise_fit: the fit with process noise by which it was judged, if `stage` needs none.
-    conditional_ratio: likelihood ratio given all other effects, if it was computed.
+    likelihood_ratio: over the model without it. without: that model, fitted; None if no exact dynamics follow the logs
+    then, and Wald's statistic is the ratio. rivals: that explain the logs about as well in its place.
     """
 
     name: str
-    stage: ExtendedFit
     likelihood_ratio: float
-    dispersion: float
+    without: ExtendedFit | None
+    rivals: tuple[EffectEntry, ...] = ()
+
+
+@dataclass(frozen=True)
+class Search:
+    """Where a search ended: the model with its effects, their choices, and what unknown forces gain beside them.
+
+    n_candidates: number that were tried. dropped: names that were chosen and given up again, with the reason.
+    """
+
+    stage: ExtendedFit
+    choices: tuple[Choice, ...]
+    left: float
     n_candidates: int
-    rivals: tuple[EffectEntry, ...]
-    unabsorbed_share: float
-    process_noise_fit: ExtendedFit | None = None
-    conditional_ratio: float | None = None
+    dropped: Mapping[str, str]
 
 
-def wald_statistic(name: str, stage: ExtendedFit) -> float:
-    """Return Wald's statistic of an effect: squared distance of its magnitude from zero, in standard deviations.
-
-    Signed shapes count together with the magnitude, as one may stand for the other. It is 0 for unidentifiable
-    parameters.
-    """
-    shapes, names, fit = stage.placed(name).effect.shapes, stage.model.base.names, stage.fit
-    parameters = [name, *(f"{name}.{s}" for s, shape in shapes.items() if shape.signed and not shape.circular)]
-    at = [k for k in (names.index(n) for n in parameters if n in names) if not fit.unidentifiable[k]]
-    distance = fit.X[at] / fit.std[at]
-    return float(
-        distance @ np.linalg.solve(fit.covariance[np.ix_(at, at)] / np.outer(fit.std[at], fit.std[at]), distance)
-    )
-
-
-def degrees_of_freedom(name: str, stage: ExtendedFit) -> int:
-    """Return the number of an effect's fitted parameters: magnitude and shapes."""
-    return sum(n == name or n.startswith(f"{name}.") for n in stage.model.base.names)
-
-
-def required_likelihood_ratio(name: str, stage: ExtendedFit, n_candidates: int) -> float:
-    """Return the likelihood ratio from which an effect is significant, given the number of candidates (Bonferroni)."""
-    return max(
-        MIN_LIKELIHOOD_RATIO, float(scipy.stats.chi2.isf(MAX_P_VALUE / n_candidates, degrees_of_freedom(name, stage)))
-    )
-
-
-def _formula_ratio(wald: float) -> float:
-    """Return the likelihood ratio that an error of formulas may cause, of effects with a sum of Wald's statistics."""
-    return min(FORMULA_ERROR**2 * wald, MAX_FORMULA_RATIO)
-
-
-def score_effects(stage: ExtendedFit, runner: CallRunner) -> tuple[score_test.Score, ...]:
-    """Score every effect that a model lacks, best first, once for each fit.
-
-    An effect that is as well a harmonic of one in the model is left out, such as a ripple of another wheel that turns
-    equally fast.
-    """
-    if not stage.scores:
-        stage.scores.append(_score_new_effects(stage, runner))
-    return stage.scores[0]
+def search(before: ExtendedFit, runner: CallRunner, report: ProgressCallback, deadline: Deadline) -> Search:
+    """Add effects to a model until none gains, and drop those that the others replace."""
+    stage, dropped, found = before, dict[str, str](), Chosen((), (), (), 0.0, ())
+    if before.data.sticks:
+        report(0.1, "fitting friction near rest")
+        stage = _with_presliding(before, runner)
+    n_candidates = 1
+    for turn in range(MAX_TURNS):
+        report(0.1 + 0.1 * turn, "scoring effects")
+        wanted = [x for x in candidates_of(stage) if x.name not in dropped]
+        form = stage.form(wanted, runner)
+        n_candidates = max(n_candidates, len({x.name for x in form.candidates}))
+        found = evidence.choose(form)
+        if len(stage.model.effects) + len(found.candidates) > MAX_EFFECTS + len(before.model.effects):
+            found = _first_of(found, MAX_EFFECTS + len(before.model.effects) - len(stage.model.effects))
+        if not found.candidates or deadline.is_over():
+            pruned = stage if deadline.is_over() else _without_needless(before, stage, runner, dropped)
+            if pruned is stage:
+                break
+            stage = pruned
+            continue
+        found = _refined(stage, found, runner)
+        report(0.15 + 0.1 * turn, "fitting effects")
+        machine = effects.with_effects(stage.machine, *entries(found))
+        try:
+            stage = _without_impossible(before, refit(machine, stage), dropped)
+        except NotConvergedError:
+            break
+    report(0.85, "testing each effect given the others")
+    stage, choices = _judged(before, stage, runner, n_candidates, deadline)
+    return Search(stage, choices, found.left, n_candidates, dropped)
 
 
-def _score_new_effects(stage: ExtendedFit, runner: CallRunner) -> tuple[score_test.Score, ...]:
-    known = [e.name for e in stage.model.effects]
+def give_up(
+    before: ExtendedFit, stage: ExtendedFit, reasons: Mapping[str, str], runner: CallRunner, deadline: Deadline
+) -> Search:
+    """Return where a search ends without some effects, given up for a reason each."""
+    try:
+        stage = refit(_without(stage, list(reasons)), stage)
+    except NotConvergedError:
+        stage = before
+    form = stage.form(candidates_of(stage), runner)
+    left = evidence.posterior(form.reduced(), ()).gain
+    n_candidates = len({x.name for x in form.candidates})
+    stage, choices = _judged(before, stage, runner, n_candidates, deadline)
+    return Search(stage, choices, left, n_candidates, dict(reasons))
+
+
+def _first_of(found: Chosen, count: int) -> Chosen:
+    return replace(found, candidates=found.candidates[:count], factors=found.factors[:count], gains=found.gains[:count])
+
+
+def candidates_of(stage: ExtendedFit) -> list[Candidate]:
+    """List every effect that a model lacks, with trial values."""
+    known = {e.name for e in stage.model.effects}
     sensors = [s.name for s in stage.data.space.sensors]
-    found = score_test.candidates(stage.machine, sensors, _duration(stage.data.logs))
-    if stage.data.sticks:
-        known_near_rest = {e.where for e in stage.model.effects if e.unsticking}
-        found = [
-            x
-            for x in found
-            if x.placed.effect.name != TRANSITION and not (x.placed.unsticking and x.placed.where in known_near_rest)
-        ]
-    wanted = [x for x in found if x.name not in known or _has_harmonics(x.placed.effect)]
-    scores = _score_along(stage, score_test.renumber_columns(wanted), runner)
-    harmonic: dict[str, float] = {}
-    for s in scores:
-        if s.candidate.name in known:
-            harmonic.setdefault(s.candidate.placed.effect.name, s.likelihood_ratio + TIE_LIKELIHOOD_RATIO)
-    new = (s for s in scores if s.candidate.name not in known)
-    return tuple(s for s in new if s.likelihood_ratio > harmonic.get(s.candidate.placed.effect.name, -np.inf))
+    found = [x for x in score_test.candidates(stage.machine, sensors, stage.data.duration) if x.name not in known]
+    if not stage.data.sticks:
+        return found
+    known_near_rest = {e.where for e in stage.model.effects if e.unsticking}
+    return [
+        x
+        for x in found
+        if x.placed.effect.name != TRANSITION and not (x.placed.unsticking and x.placed.where in known_near_rest)
+    ]
 
 
-def _has_harmonics(effect: Effect) -> bool:
-    shapes = effect.shapes.values()
-    return any(s.circular for s in shapes) and any(s.whole and len(s.grid) > 1 for s in shapes)
+def _refined(stage: ExtendedFit, found: Chosen, runner: CallRunner) -> Chosen:
+    """Refine magnitudes, shapes and instants of chosen candidates between their trial values."""
+    duration = stage.data.duration
+    reaches, timed = [*REFINEMENT_REACHES], list[float]()
+    while [*reaches, *timed][-1] * duration / TIME_TRIAL_SHARE > INSTANT_ACCURACY_S:
+        timed.append([*reaches, *timed][-1] * REFINEMENT_REACHES[-1])
+    for reach in (*reaches, *timed):
+        lists = []
+        for x in found.candidates:
+            score = score_test.Score(x, 0.0, {}, 1.0)
+            wanted = reach in reaches or x.placed.effect.timed
+            nearby = score_test.refine_candidates([score], stage.machine, duration, reach) if wanted else []
+            lists.append([x, *nearby])
+        if all(len(own) <= 2 for own in lists):
+            continue
+        found = _best_nearby(stage, lists, runner)
+    return found
 
 
-def _score_along(
-    stage: ExtendedFit, found: Sequence[score_test.Candidate], runner: CallRunner
-) -> tuple[score_test.Score, ...]:
-    return score_test.score_candidates(stage.fitted_logs, stage.fit, found, runner)
+def _best_nearby(stage: ExtendedFit, lists: Sequence[Sequence[Candidate]], runner: CallRunner) -> Chosen:
+    """Return the best of each list of candidates, the first of each to begin with, beside those of the others."""
+    form = stage.form([x for own in lists for x in own], runner).reduced()
+    every, at = list(form.candidates), 0
+    places = []
+    for own in lists:
+        places.append(range(at, at + len(own)))
+        at += len(own)
+    chosen = [every[place[0]] for place in places]
+    now = evidence.posterior(form, chosen)
+    for k, place in enumerate(places):
+        others = [x for j, x in enumerate(chosen) if j != k]
+        gains = evidence.first_gains(form, others, now.logs)
+        best = max(place, key=lambda j: float(gains[j]))
+        if gains[best] > -np.inf:
+            chosen[k] = every[best]
+    now = evidence.posterior(form, chosen, now.logs, evidence.COMPARING_PASSES)
+    return Chosen(tuple(chosen), tuple(now.factors(form, chosen)), (), now.gain, tuple(np.exp(now.logs)))
 
 
-def _duration(logs: Sequence[Log]) -> float:
-    return max(float(log.t[-1] - log.t[0]) for log in logs)
+def entries(found: Chosen) -> list[EffectEntry]:
+    """Return chosen candidates as entries of the machine file, from which a fit starts."""
+    return [_start_entry(x, factor) for x, factor in zip(found.candidates, found.factors, strict=True)]
 
 
-def _start_entry(score: score_test.Score) -> EffectEntry:
-    """Return a candidate as an entry of the machine file, from which a fit starts."""
-    e, values = score.candidate.placed, dict(score.values)
+def _start_entry(x: Candidate, factor: np.ndarray) -> EffectEntry:
+    e, values = x.placed, dict(x.placed.values)
     magnitude = values.pop("A")
+    if len(factor) == 2:
+        circular = next(n for n, s in e.effect.shapes.items() if s.circular)
+        values[circular] = float(np.arctan2(factor[1], factor[0]))
+        step = float(np.hypot(*factor))
+    else:
+        step = float(factor[0])
     if len(e.effect.grid) > 1:
         # The signature is not proportional to the magnitude: stay where it holds.
-        step = float(np.clip(magnitude / e.values["A"], MIN_SIGNATURE_STEP, MAX_SIGNATURE_STEP))
-        magnitude = e.values["A"] / step if e.effect.inverse else e.values["A"] * step
-    return identified_entry(
-        e.effect.name, e.where, magnitude, {n: round(v, 12) for n, v in values.items() if n in e.shapes}
-    )
-
-
-def _requests(stage: ExtendedFit, scores: Sequence[score_test.Score], process_noise: float) -> list[RefitRequest]:
-    """Return requests to fit a model with each of several candidates."""
-    machines = (effects.with_effects(stage.machine, _start_entry(s)) for s in scores)
-    return [(machine, stage, process_noise) for machine in machines]
+        step = float(np.clip(step, MIN_SIGNATURE_STEP, MAX_SIGNATURE_STEP))
+        magnitude = magnitude / step if e.effect.inverse else magnitude * step
+    else:
+        magnitude = float(np.clip(magnitude * step, -e.effect.largest, e.effect.largest))
+    shapes = {n: round(v, 12) for n, v in values.items() if n in e.shapes}
+    return identified_entry(e.effect.name, e.where, magnitude, shapes)
 
 
 def fitted_entry(stage: ExtendedFit, name: str) -> EffectEntry:
     """Return an effect as an entry of the machine file, with magnitude and shapes of a fit."""
-    placed = stage.placed(name)
-    values = _fitted_values(stage, placed)
+    placed = stage.fitted(name)
+    values = dict(placed.values)
     magnitude = values.pop("A")
     if placed.effect.positive:  # a machine file must not have zero here
         magnitude = max(magnitude, 2 * SMALLEST_VALUE)
@@ -223,12 +223,6 @@ def fitted_machine(stage: ExtendedFit) -> Machine:
     return machine
 
 
-def _fitted_values(stage: ExtendedFit, placed: PlacedEffect) -> dict[str, float]:
-    """Return magnitude and shapes of an effect in a fit."""
-    fitted = dict(zip(stage.model.base.names, stage.fit.X, strict=True))
-    return {key: float(fitted.get(p, placed.values[key])) for p, (key, _) in placed.parameters.items()}
-
-
 def identified_entry(effect: str, where: str, magnitude: float, shapes: Mapping[str, float]) -> EffectEntry:
     """Return an effect with identified magnitude and shapes as an entry of the machine file."""
 
@@ -240,420 +234,170 @@ def identified_entry(effect: str, where: str, magnitude: float, shapes: Mapping[
     )
 
 
-def _shortlist(
-    stage: ExtendedFit, scores: Sequence[score_test.Score], chosen: Sequence[Choice]
-) -> list[score_test.Score]:
-    """Return the best candidate of each variant, best first, as far as it is worth a fit.
-
-    There are MAX_CANDIDATES, and further variants of the likeliest FIRST_BATCH names.
-    """
-    best: dict[tuple[str, ...], score_test.Score] = {}
-    best_of_name: dict[str, float] = {}
-    min_score = (
-        max(MIN_SCORE, MIN_SCORE_SHARE[stage.first_order_is_rough] * scores[0].likelihood_ratio) if scores else 0.0
-    )
-    for s in scores:
-        explains_all = _has_large_excess(stage) and MAX_RATIO_OVER_SCORE * s.likelihood_ratio >= stage.excess_cost
-        required = (
-            _required_gain(stage, chosen, s.candidate, 0.0) / MAX_RATIO_OVER_SCORE
-            if stage.estimated and not explains_all
-            else 0.0
-        )
-        is_worth_a_fit = s.likelihood_ratio >= max(required, min_score) and s.values["A"] != 0
-        share = VARIANT_SCORE_SHARE if len(s.candidate.variant) > 1 else PLAIN_VARIANT_SCORE_SHARE
-        if is_worth_a_fit and s.likelihood_ratio >= share * best_of_name.setdefault(
-            s.candidate.name, s.likelihood_ratio
-        ):
-            best.setdefault(s.candidate.variant, s)
-    shortlist = list(best.values())
-    first = _unique_names(shortlist)[:FIRST_BATCH]
-    return [*shortlist[:MAX_CANDIDATES], *(s for s in shortlist[MAX_CANDIDATES:] if s.candidate.name in first)]
+def added(before: ExtendedFit, stage: ExtendedFit) -> list[str]:
+    """Return the names of the effects that a model has beyond another."""
+    known = {e.name for e in before.model.effects}
+    return [e.name for e in stage.model.effects if e.name not in known]
 
 
-def _refined_shortlist(
-    stage: ExtendedFit, scores: Sequence[score_test.Score], chosen: Sequence[Choice], runner: CallRunner
-) -> list[score_test.Score]:
-    """Return the candidates that are worth a fit, refined between trial values."""
-    shortlist, duration = _shortlist(stage, scores, chosen), _duration(stage.data.logs)
-    for reach in (*REFINEMENT_REACHES, *_reaches_in_time(duration)) if shortlist else ():
-        refinable = [s for s in shortlist if reach in REFINEMENT_REACHES or s.candidate.placed.effect.timed]
-        nearby = score_test.refine_candidates(refinable, stage.machine, duration, reach)
-        if len(nearby) > len(refinable):
-            shortlist = _shortlist(
-                stage,
-                sorted([*shortlist, *_score_along(stage, nearby, runner)], key=lambda s: -s.likelihood_ratio),
-                chosen,
-            )
-    return shortlist
+def degrees_of_freedom(name: str, stage: ExtendedFit) -> int:
+    """Return the number of an effect's fitted parameters: magnitude and shapes."""
+    return len(stage.parameters_of(name))
 
 
-def _reaches_in_time(duration: float) -> list[float]:
-    """Return further reaches of refinement until instants are known, for a log of a duration [s]."""
-    found = [REFINEMENT_REACHES[-1]]
-    while found[-1] * duration / TIME_TRIAL_SHARE > INSTANT_ACCURACY_S:
-        found.append(found[-1] * REFINEMENT_REACHES[-1])
-    return found[1:]
-
-
-def choose_effect(
-    stage: ExtendedFit,
-    scores: Sequence[score_test.Score],
-    chosen: Sequence[Choice],
-    runner: CallRunner,
-    report: ProgressCallback,
-    done: float,
-) -> Choice | None:
-    """Choose the effect that explains most beside those chosen; None if none is worth a place."""
-    shortlist = _refined_shortlist(stage, scores, chosen, runner)
-    if not shortlist:
-        return None
-
-    def report_fit(k: int) -> None:
-        report(done + 0.03 * min(k, MAX_CANDIDATES), f"fitting {shortlist[k].candidate.name}")
-
-    cost_limit = np.inf
-    if _noise_hides_misfit(stage):
-        cost_limit = stage.fit.cost - CANDIDATE_PROGRESS_SHARE * min(
-            _required_gain(stage, chosen, s.candidate, 0.0) for s in shortlist
-        )
-    trials, implausible = _fit_candidates(stage, shortlist, runner, report_fit, cost_limit)
-    if stage.exact and _likeliest_not_found(shortlist, trials, implausible):
-        # Exact dynamics give no fit of the likeliest cause: judge all with process noise.
-        known = chosen[-1].process_noise_fit if chosen else None
-        if known is not None and known.machine is stage.machine and known.fit.process_noise == MIN_PROCESS_NOISE:
-            stage = known
-        else:
-            try:
-                stage = refit(stage.machine, stage, MIN_PROCESS_NOISE)
-            except NotConvergedError:
-                return None
-        found = score_test.renumber_columns([s.candidate for s in shortlist])
-        shortlist = _shortlist(stage, _score_along(stage, found, runner), chosen)
-        if not shortlist:
-            return None
-        trials, _ = _fit_candidates(stage, shortlist, runner, lambda k: None)
-    if not trials:
-        return None
-    score, best = trials[0]
-    gain = stage.deviance - best.deviance
-    level = required_likelihood_ratio(score.candidate.name, best, len(scores))
-    explains_all = _explains_rest(best, stage)
-    if gain < max(
-        level * best.dispersion, 0.0 if explains_all else _required_gain(stage, chosen, score.candidate, 0.0)
-    ):
-        return None
-    is_weak = not explains_all and gain < _required_gain(stage, chosen, score.candidate)
-    if is_weak and not best.is_close:
-        return None
-    choice = _make_choice(trials, gain, len(scores), runner)
-    if not is_weak:
-        return choice
-    return replace(choice, process_noise_fit=None) if choice.stage.exact and choice.stage.is_close else None
-
-
-def _make_choice(trials: Sequence[_Trial], gain: float, n_candidates: int, runner: CallRunner) -> Choice:
-    """Choose the best trial, without process noise if possible, and its ties as rivals.
-
-    Trials that tie only with process noise are rivals, too. A trial that makes parameters impossible gives way to one
-    that does not, and is no rival of it.
-    """
-    dispersion = trials[0][1].dispersion
-    with_noise = {s.candidate.name: stage for s, stage in trials if not stage.exact}
-    ties, lowest = _tied_trials(trials, gain), min(x.deviance for _, x in trials)
-    names = {s.candidate.name for s, _ in ties}
-    # Process noise hides how well effects explain the logs: all are compared without it.
-    exact, unknown = _trials_without_noise(trials if with_noise else ties, runner)
-    unknown = [x for x in unknown if x[0].candidate.name in names]
-    if not any(s.candidate.name in names for s, _ in exact):
-        exact = []  # none of the best trials has an exact fit: compare all with process noise
-    judged = [*_tied_trials(exact, gain), *unknown] if exact else ties
-    judged = _without_needless_magnitudes(judged)
-    if judged[0][1].is_dead_end:
-        judged = [x for x in judged if x[1].exact and x[1].is_close and not x[1].impossible] or judged
-    score, best = judged[0]
-    tied = [x for x in judged[1:] if best.impossible or not x[1].impossible]
-    rivals = tuple(fitted_entry(other, s.candidate.name) for s, other in tied)
-    process_noise_fit = with_noise.get(score.candidate.name) if best.exact else None
-    behind = next(x.deviance for s, x in trials if s.candidate.name == score.candidate.name) - lowest
-    gain -= min(behind, (1 - VARIANT_SCORE_SHARE) * gain)  # a tie may be further behind if much is left
-    return Choice(
-        score.candidate.name, best, gain, dispersion, n_candidates, rivals, score.unabsorbed_share, process_noise_fit
+def required_likelihood_ratio(name: str, stage: ExtendedFit, n_candidates: int) -> float:
+    """Return the likelihood ratio from which an effect is significant, given the number of candidates (Bonferroni)."""
+    return max(
+        MIN_LIKELIHOOD_RATIO, float(scipy.stats.chi2.isf(MAX_P_VALUE / n_candidates, degrees_of_freedom(name, stage)))
     )
 
 
-def choose_presliding(stage: ExtendedFit, runner: CallRunner, deadline: Deadline | None = None) -> list[Choice]:
-    """Choose the joints whose friction near rest builds up over an angle, where it was taken for free.
-
-    It comes before other effects: they are sought in what is left where friction near rest is known. deadline: no
-    further joint is begun after it.
-    """
-    chosen, scores = list[Choice](), score_effects(stage, runner)
-    wanted = {s.candidate.name: s for s in reversed(scores) if s.candidate.placed.effect.name == PRESLIDING}
-    entries = {name: _start_entry(s) for name, s in wanted.items()}
-    while entries and not (deadline is not None and deadline.is_over()):
-        requests = [(effects.with_effects(stage.machine, entry), stage, 0.0) for entry in entries.values()]
-        fits = zip(entries, refit_all(requests, runner), strict=True)
-        found = {n: x for n, x in fits if x is not None and x.is_close and not x.impossible and _is_effective(n, x)}
-        name = min(found, key=lambda name: found[name].deviance, default="")
-        if not name:
-            break
-        best = found[name]
-        gain = stage.deviance - best.deviance
-        if gain < required_likelihood_ratio(name, best, len(scores)):
-            break
-        chosen.append(Choice(name, best, gain, best.dispersion, len(scores), (), unabsorbed_share=1.0))
-        entries |= {n: entries[n].model_copy(update={"amount": fitted_entry(x, n).amount}) for n, x in found.items()}
-        del entries[name]
-        stage = best
-    return chosen
+def _without(stage: ExtendedFit, names: Sequence[str]) -> Machine:
+    machine = fitted_machine(stage)
+    for name in names:
+        machine = effects.without_effect(machine, name)
+    return machine
 
 
-def choose_with_inflated_noise(stage: ExtendedFit, runner: CallRunner) -> tuple[ExtendedFit, list[Choice]] | None:
-    """Choose the first effect with inflated sensor noise, if the model tracks the logs only then.
-
-    Inflated noise leaves the misfit that shows the cause, and nearly right models track the logs. The effect must let
-    the model track the logs with the true noise; a pair is tried if none does. Return the fit without the effect, and
-    the choices: none if the model needs no effect after all. Return None if nothing tracks the logs.
-    """
-    begun_without = resume_with_true_sensor_noise([stage], 0.0, runner)
-    scores, required = score_effects(stage, runner), MIN_EXCESS_SHARE[1] * stage.excess_cost
-    plain = next(begun_without)
-    if plain is not None and plain.is_close:
-        return plain, []
-    shortlist = _refined_shortlist(stage, scores, (), runner)
-    trials, _ = _fit_candidates(
-        stage, shortlist, runner, lambda k: None, stage.fit.cost - CANDIDATE_PROGRESS_SHARE * required
-    )
-    if not trials:
-        return None
-    _, best = trials[0]
-    gain = stage.deviance - best.deviance
-    if gain < max(MIN_LIKELIHOOD_RATIO * best.dispersion, required):
-        return None
-    is_comparable = [x for x in trials if stage.deviance - x[1].deviance >= VARIANT_SCORE_SHARE * gain]
-    tracking: list[_Trial] = []
-    explains_most = gain >= MIN_EXPLAINED_SHARE * (gain + best.excess_cost)
-    for process_noise in (0.0, PROCESS_NOISE_LEVELS[0])[: 1 + explains_most]:
-        sharp = zip(
-            is_comparable,
-            resume_with_true_sensor_noise([x for _, x in is_comparable], process_noise, runner),
-            strict=True,
-        )
-        found = [(score, x) for (score, _), x in sharp if x is not None and x.tracks_logs]
-        found = [(score, x) for score, x in found if not _fell_to_zero(score.candidate.name, x)]
-        tracking = tracking or found
-        if near := _best_variants([x for x in found if x[1].is_close]):
-            tracking = near
-            break
-    if not tracking:
-        both = _choose_pair(stage, trials[0], len(scores), runner)
-        return (stage, both) if both else None
-    tracking = _best_variants(tracking)
-    score, best = tracking[0]
-    ratio = _ratio_with_true_noise(score.candidate.name, best, gain, stage, plain)
-    if ratio < MIN_LIKELIHOOD_RATIO * best.dispersion:
-        return None
-    return stage, [_make_choice(tracking, ratio, len(scores), runner)]
+def _without_impossible(before: ExtendedFit, stage: ExtendedFit, dropped: dict[str, str]) -> ExtendedFit:
+    """Return a fit without effects whose magnitudes fell to zero or that no machine has. Raises NotConvergedError."""
+    while names := [n for n in added(before, stage) if _fell_to_zero(n, stage) or not is_plausible(n, stage)]:
+        dropped.update({n: "its size is impossible" for n in names if not is_plausible(n, stage)})
+        stage = refit(_without(stage, names), stage)
+    return stage
 
 
-def _ratio_with_true_noise(
-    name: str, best: ExtendedFit, gain: float, inflated: ExtendedFit, plain: ExtendedFit | None
-) -> float:
-    """Estimate the likelihood ratio with the true sensor noise, from the one with inflated noise.
-
-    Wald's statistic bounds it, but is too large far from zero. The inflated fit says too little: without the effect,
-    the cost would be that of the plain fit, or if there is none, larger by the inflation, as far as a fit is not given
-    up.
-    """
-    inflation = inflated.data.noise_inflation
-    without = (
-        min(inflation**2 * gain, LOST_COST_RATIO * best.expected_cost - best.fit.cost)
-        if plain is None
-        else plain.deviance - best.deviance
-    )
-    return min(wald_statistic(name, best), max(inflation * gain, without))
-
-
-def _choose_pair(stage: ExtendedFit, first: _Trial, n_candidates: int, runner: CallRunner) -> list[Choice]:
-    """Choose two effects that together let exact dynamics come close to the logs; empty if there are none.
-
-    The first is the best with inflated noise, and must explain a good part of the excess.
-    """
-    score, first_fit = first
-    if stage.deviance - first_fit.deviance < MIN_EXCESS_SHARE_OF_FIRST * stage.excess_cost:
-        return []
-    scores, cost_limit = score_effects(first_fit, runner), TRACKING_COST_RATIO * first_fit.expected_cost
-    shortlist = _refined_shortlist(first_fit, scores, (), runner)
-    if not shortlist:
-        return []
-    trials, _ = _fit_candidates(first_fit, shortlist, runner, lambda k: None, cost_limit)
-    trials = [x for x in trials if x[1].fit.cost <= cost_limit]
-    every = zip(trials, resume_with_true_sensor_noise([x for _, x in trials], 0.0, runner), strict=True)
-    found = [(s, inflated, x) for (s, inflated), x in every if x is not None and x.is_close]
-    found = [x for x in found if not any(_fell_to_zero(e.candidate.name, x[2]) for e in (score, x[0]))]
-    if not found:
-        return []
-    second, inflated, best = min(found, key=lambda x: x[2].deviance)
-    ratio = (
-        _ratio_with_true_noise(score.candidate.name, best, stage.deviance - first_fit.deviance, stage, None),
-        _ratio_with_true_noise(second.candidate.name, best, first_fit.deviance - inflated.deviance, stage, None),
-    )
-    if min(ratio) < MIN_LIKELIHOOD_RATIO * best.dispersion:
-        return []
-    return [
-        Choice(score.candidate.name, first_fit, ratio[0], best.dispersion, n_candidates, (), score.unabsorbed_share),
-        _make_choice(_best_variants([(s, x) for s, _, x in found]), ratio[1], len(scores), runner),
-    ]
-
-
-def choose_from_start(stage: ExtendedFit, runner: CallRunner) -> tuple[ExtendedFit, list[Choice]]:
-    """Choose the first effect by exact fits from initial trajectories, if no model without effects was found.
-
-    With the effect there may be a fit without it after all, since the start was too far off; it is then compared with
-    that. Return the fit without the effect, and the choice, if any.
-    """
-    scores = score_effects(stage, runner)
-    shortlist = _refined_shortlist(stage, scores, (), runner)
-    found = zip(shortlist, fit_all_from_start(_requests(stage, shortlist, 0.0), runner), strict=True)
-    trials = [(s, x) for s, x in found if x is not None and x.is_close and _is_effective(s.candidate.name, x)]
-    if not trials:
-        return stage, []
-    trials = _best_variants(trials)
-    score, best = trials[0]
-    with suppress(NotConvergedError):
-        stage = refit(stage.machine, best, 0.0)
-    gain = stage.deviance - best.deviance if stage.estimated else wald_statistic(score.candidate.name, best)
-    if gain < MIN_LIKELIHOOD_RATIO * best.dispersion:
-        return stage, []
-    return stage, [_make_choice(trials, gain, len(scores), runner)]
-
-
-def _required_gain(
-    stage: ExtendedFit,
-    chosen: Sequence[Choice],
-    candidate: score_test.Candidate,
-    share_with_noise: float = MIN_GAIN_SHARE_WITH_NOISE,
-) -> float:
-    """Return the likelihood ratio that makes an effect worth a place beside those chosen.
-
-    share_with_noise: share of their gains that is required if process noise hides errors of their formulas.
-    """
-    # An effect that acts at some time only follows the error of a formula best.
-    least = max(MAX_FORMULA_SHARE * candidate.placed.effect.timed, share_with_noise * (not stage.exact))
-    shares = [max(least, min(FORMULA_ERROR**2 / x.unabsorbed_share, MAX_FORMULA_SHARE)) for x in chosen]
-    formulas = sum(share * x.likelihood_ratio for share, x in zip(shares, chosen, strict=True))
-    rough = ((x.likelihood_ratio, effects.CATALOGUE[x.name.split("@")[0]].formula_error) for x in chosen)
-    formulas = max(formulas, sum(min(error**2 * ratio, MAX_FORMULA_RATIO) for ratio, error in rough))
-    main = not stage.is_close if chosen else _noise_hides_misfit(stage)
-    explained = MIN_EXCESS_SHARE_OF_FIRST if main else MIN_EXCESS_SHARE[stage.first_order_is_rough]
-    wald = sum(wald_statistic(e.name, stage) for e in stage.model.effects if not e.effect.inverse)
-    return max(explained * stage.excess_cost, formulas, _formula_ratio(wald))
-
-
-def _noise_hides_misfit(stage: ExtendedFit) -> bool:
-    """Tell if large process noise leaves a misfit: with it many wrong models come far."""
-    return stage.fit.process_noise >= PROCESS_NOISE_LEVELS[0] and not stage.is_close
-
-
-def _explains_rest(found: ExtendedFit, before: ExtendedFit) -> bool:
-    """Tell if exact dynamics leave nothing with an effect and much without.
-
-    No effect removes the error of another one's formula entirely.
-    """
-    return _has_large_excess(before) and found.exact and found.excess_cost == 0
-
-
-def _has_large_excess(stage: ExtendedFit) -> bool:
-    """Tell if exact dynamics leave a large misfit."""
-    return stage.exact and stage.excess_cost > LARGE_EXCESS_RATIO * stage.expected_cost
-
-
-def _fit_candidates(
-    stage: ExtendedFit,
-    shortlist: Sequence[score_test.Score],
-    runner: CallRunner,
-    report: Callable[[int], None],
-    cost_limit: float = np.inf,
-) -> tuple[list[_Trial], set[str]]:
-    """Fit candidates with the model's process noise.
-
-    The likeliest FIRST_BATCH are fitted first, the others as long as they do not stay far behind. Those with much lower
-    scores come last, and only if they may still come near. A magnitude that falls to zero counts as no fit.
-    cost_limit: cost above which every fit is given up.
-
-    Return the best variant of each name, and the names that were fitted but are implausible.
-    """
-    trials, implausible = list[_Trial](), set[str]()
-    n_promising = max(
-        FIRST_BATCH, sum(MAX_RATIO_OVER_SCORE * s.likelihood_ratio >= shortlist[0].likelihood_ratio for s in shortlist)
-    )
-    for at, batch in (
-        (0, shortlist[:FIRST_BATCH]),
-        (FIRST_BATCH, shortlist[FIRST_BATCH:n_promising]),
-        (n_promising, shortlist[n_promising:]),
-    ):
-        gained = max((stage.deviance - found.deviance for _, found in trials), default=0.0)
-        if not batch or (at >= n_promising and gained > MAX_RATIO_OVER_SCORE * batch[0].likelihood_ratio):
+def _without_needless(
+    before: ExtendedFit, stage: ExtendedFit, runner: CallRunner, dropped: dict[str, str]
+) -> ExtendedFit:
+    """Return a fit without an effect that gains little beside the others; the same if there is none."""
+    names = added(before, stage)
+    machines = [_without(stage, [n]) for n in names]
+    worst: tuple[float, str, ExtendedFit] | None = None
+    for name, found in zip(names, refit_all(machines, stage, runner), strict=True):
+        if found is None:
             continue
-        requests = _requests(stage, batch, stage.fit.process_noise)
-        report(at)
-        batch_limit = cost_limit
-        if trials and not stage.data.sticks:  # costs are not comparable where only some models free friction near rest
-            batch_limit = min(cost_limit, stage.fit.cost - CANDIDATE_PROGRESS_SHARE * gained)
-        for k, (score, found) in enumerate(zip(batch, refit_all(requests, runner, batch_limit), strict=True)):
-            report(min(at + k + 1, len(shortlist) - 1))
-            if found is None or _fell_to_zero(score.candidate.name, found):
-                continue
-            if _is_plausible(score.candidate.name, found):
-                trials.append((score, found))
-            else:
-                implausible.add(score.candidate.name)
-        others = shortlist[at + len(batch) :]
-        if (
-            stage.exact
-            and _likeliest_not_found(shortlist, trials, implausible)
-            and shortlist[0].candidate.name not in _unique_names(others)
-        ):
-            break
-    known = {s.candidate.name for s, _ in trials} | implausible
-    likely = [s for s in shortlist if s.likelihood_ratio >= RESTART_SCORE_SHARE * shortlist[0].likelihood_ratio]
-    trials += _fit_anew(stage, [s for s in likely if s.candidate.name not in known], runner, cost_limit)
-    return _best_variants(trials), implausible
+        excess = found.deviance - stage.deviance - MIN_LIKELIHOOD_RATIO * stage.dispersion
+        if excess < 0 and (worst is None or excess < worst[0]):
+            worst = excess, name, found
+    if worst is None:
+        return stage
+    dropped[worst[1]] = "the other effects replace it"
+    return worst[2]
 
 
-def _fit_anew(
-    stage: ExtendedFit, missing: Sequence[score_test.Score], runner: CallRunner, cost_limit: float
-) -> list[_Trial]:
-    """Fit the best variant of each likely candidate from initial trajectories, as none was found from the fit before.
+def _judged(
+    before: ExtendedFit, stage: ExtendedFit, runner: CallRunner, n_candidates: int, deadline: Deadline
+) -> tuple[ExtendedFit, tuple[Choice, ...]]:
+    """Exchange each effect for a rival that explains the logs better, and return those that explain them as well."""
+    names = added(before, stage)
+    if not names:
+        return stage, ()
+    if not stage.exact or deadline.is_over():
+        return stage, tuple(Choice(n, stage.wald(n), None) for n in names)
+    form = stage.form([*candidates_of(stage), *(_own_candidate(stage, n) for n in names)], runner)
+    machines, owners = list[Machine](), list[tuple[str, EffectEntry | None]]()
+    for name in names:
+        machines.append(_without(stage, [name]))
+        owners.append((name, None))
+        for entry in _likely_rivals(form, stage, name):
+            machines.append(effects.with_effects(_without(stage, [name]), entry))
+            owners.append((name, entry))
+    results = list(refit_all(machines, stage, runner))
+    choices = []
+    for name in names:
+        own = [(entry, x) for (n, entry), x in zip(owners, results, strict=True) if n == name]
+        without = own[0][1]
+        ratio = without.deviance - stage.deviance if without is not None else stage.wald(name)
+        rivals = [(x, _named(x, entry)) for entry, x in own[1:] if entry is not None and x is not None]
+        rivals = [(x, n) for x, n in rivals if not _fell_to_zero(n, x) and is_plausible(n, x) and not x.impossible]
+        better = [x for x, n in rivals if information(x, n) < information(stage, name) - CLEARLY_BETTER]
+        if better:
+            return _judged(before, min(better, key=lambda x: x.deviance), runner, n_candidates, deadline)
+        margin = 2 * np.log(evidence.CREDIBLE_ODDS) * stage.dispersion + formula_ratio(ratio)
+        tied = [(x, n) for x, n in rivals if information(x, n) - information(stage, name) < margin]
+        choices.append(Choice(name, ratio, without, tuple(fitted_entry(x, n) for x, n in tied)))
+    return stage, tuple(choices)
 
-    A cause that found no fit would lose to a rival that did.
-    """
-    first = list({s.candidate.name: s for s in reversed(missing)}.values())
-    requests = _requests(stage, first, stage.fit.process_noise)
-    found = zip(first, fit_all_from_start(requests, runner, cost_limit), strict=True)
-    return [(s, x) for s, x in found if x is not None and _is_effective(s.candidate.name, x)]
+
+CLEARLY_BETTER = 10.0  # likelihood ratio by which a rival must be better to take an effect's place; chosen
 
 
-def _unique_names(scores: Sequence[score_test.Score]) -> list[str]:
-    """Return the names of candidates, each once."""
-    return list(dict.fromkeys(s.candidate.name for s in scores))
+def formula_ratio(ratio: float) -> float:
+    """Return the likelihood ratio that an error of an effect's formula may cause."""
+    return float(min(FORMULA_ERROR**2 * ratio, MAX_FORMULA_RATIO))
 
 
-def _likeliest_not_found(
-    shortlist: Sequence[score_test.Score], trials: Sequence[_Trial], implausible: Container[str]
-) -> bool:
-    """Tell if no fit of the likeliest candidate was found."""
-    name = shortlist[0].candidate.name
-    return name not in implausible and all(s.candidate.name != name for s, _ in trials)
+def information(stage: ExtendedFit, name: str) -> float:
+    """Return the deviance with a price for each parameter of an effect: the information of G. Schwarz (1978)."""
+    return stage.deviance + float(np.log(stage.data.n_readings)) * degrees_of_freedom(name, stage)
 
 
-def _is_plausible(name: str, stage: ExtendedFit) -> bool:
+def _named(stage: ExtendedFit, entry: EffectEntry) -> str:
+    return next(e.name for e in stage.model.effects if e.effect.name == entry.name and e.where == entry.where)
+
+
+def _own_candidate(stage: ExtendedFit, name: str) -> Candidate:
+    placed = stage.fitted(name)
+    return Candidate(placed, (0,))
+
+
+def _likely_rivals(form: evidence.Form, stage: ExtendedFit, name: str) -> list[EffectEntry]:
+    """Return the candidates that to first order gain about as much as an effect in its place, best first."""
+    at = stage.parameters_of(name)
+    own = stage.model.base.names.index(name)
+    value = np.array([-stage.fit.X[k] / stage.model.scale[k] if k == own else 0.0 for k in at])
+    form = form.without(at, value).reduced()
+    nothing = np.full(len(form.names), -30.0)
+    gains = evidence.first_gains(form, (), nothing)
+    effect_itself = next(k for k, x in enumerate(form.candidates) if x.name == name)
+    known = {e.name for e in stage.model.effects}
+    least = max(gains[effect_itself] - max(RIVAL_LOSS, RIVAL_LOSS_SHARE * gains[effect_itself]), 0.0)
+    best: dict[str, int] = {}
+    for k in np.argsort(-gains):
+        if gains[k] > least and form.candidates[k].name not in known:
+            best.setdefault(form.candidates[k].name, int(k))
+    found = []
+    for k in list(best.values())[:MAX_RIVALS]:
+        x = form.candidates[k]
+        found.append(_start_entry(x, evidence.posterior(form, [x], nothing, 0).factors(form, [x])[0]))
+    return found
+
+
+def _with_presliding(stage: ExtendedFit, runner: CallRunner) -> ExtendedFit:
+    """Return a fit with presliding at each joint where it describes friction near rest better than free friction."""
+    while True:
+        wanted = [x for x in candidates_of(stage) if x.placed.effect.name == PRESLIDING]
+        if not wanted:
+            return stage
+        form = stage.form(wanted, runner).reduced()
+        gains = evidence.first_gains(form, (), np.full(len(form.names), -30.0))
+        best: dict[str, int] = {}
+        for k in np.argsort(-gains):
+            best.setdefault(form.candidates[k].name, int(k))
+        machines = [
+            effects.with_effects(
+                stage.machine, _start_entry(form.candidates[k], np.ones(len(form.candidates[k].columns)))
+            )
+            for k in best.values()
+        ]
+        tried = [
+            (stage.deviance - x.deviance - required_likelihood_ratio(name, x, len(best)), x)
+            for name, x in zip(best, refit_all(machines, stage, runner), strict=True)
+            if x is not None and not _fell_to_zero(name, x) and is_plausible(name, x)
+        ]
+        excess, found = max(tried, key=lambda x: x[0], default=(0.0, stage))
+        if excess <= 0:
+            return stage
+        stage = found
+
+
+def is_plausible(name: str, stage: ExtendedFit) -> bool:
     """Tell if an effect's fitted magnitude and shapes are possible.
 
     If it shakes a torque sensor, one of the logs must show that, or none can.
     """
-    placed = stage.placed(name)
-    fitted = replace(placed, values={**placed.values, **_fitted_values(stage, placed)})
+    placed, fitted = stage.placed(name), stage.fitted(name)
     k = stage.model.base.names.index(name)
     beyond = abs(float(stage.fit.X[k])) - fitted.effect.largest
     if not effects.shapes_possible(stage.machine, fitted) or beyond > IMPOSSIBLE_SIGN_STDS * stage.fit.std[k]:
@@ -686,75 +430,3 @@ def _fell_to_zero(name: str, stage: ExtendedFit) -> bool:
         and not fit.unidentifiable[k]
         and bool(fit.X[k] < MIN_MAGNITUDE_STDS * fit.std[k])
     )
-
-
-def _is_effective(name: str, stage: ExtendedFit) -> bool:
-    """Tell if an effect in a fit is present and plausible."""
-    return not _fell_to_zero(name, stage) and _is_plausible(name, stage)
-
-
-def _best_variants(trials: Sequence[_Trial]) -> list[_Trial]:
-    """Return the best variant of each name, best first: least process noise, then least information."""
-    best: dict[str, _Trial] = {}
-    for x in sorted(trials, key=lambda x: (x[1].fit.process_noise, _information(x))):
-        best.setdefault(x[0].candidate.name, x)
-    return list(best.values())
-
-
-def _information(trial: _Trial) -> float:
-    """Return the deviance with a price for each parameter of an effect: the information of G. Schwarz (1978)."""
-    score, stage = trial
-    price = np.log(stage.data.n_readings) / stage.data.noise_inflation**2
-    return stage.deviance + price * degrees_of_freedom(score.candidate.name, stage)
-
-
-def _tied_trials(trials: Sequence[_Trial], gain: float) -> list[_Trial]:
-    """Return the best of sorted trials, and those that explain the logs about as well.
-
-    Differences that an error of the best effect's formula may cause do not count, nor do those of chance.
-    """
-    score, best = trials[0]
-    share = FORMULA_ERROR**2 if best.exact else TIE_GAIN_SHARE_WITH_NOISE
-    margin = max(TIE_LIKELIHOOD_RATIO * best.dispersion, TIE_EXCESS_SHARE * best.excess_cost, share * gain)
-    if best.exact and not score.candidate.placed.effect.inverse:  # with process noise it gains less than without
-        margin = max(margin, _formula_ratio(wald_statistic(score.candidate.name, best)))
-    lowest = _information(trials[0])
-
-    def ties(trial: _Trial) -> bool:
-        rough = max(x.candidate.placed.effect.formula_error for x in (score, trial[0]))
-        return _information(trial) - lowest < max(margin, rough**2 * gain)
-
-    return [x for x in trials if ties(x)]
-
-
-def _without_needless_magnitudes(trials: Sequence[_Trial]) -> list[_Trial]:
-    """Return trials without those that gain no more over the effect that they come to at zero than chance does.
-
-    Friction by bristles that bend is presliding where no Stribeck friction adds to it.
-    """
-    deviances = {(s.candidate.name, stage.fit.process_noise): stage.deviance for s, stage in trials}
-    least = MIN_LIKELIHOOD_RATIO * trials[0][1].dispersion
-
-    def is_needless(trial: _Trial) -> bool:
-        simpler, stage = trial[0].candidate.placed.simpler, trial[1]
-        return (
-            simpler is not None and deviances.get((simpler, stage.fit.process_noise), np.inf) - stage.deviance < least
-        )
-
-    return [x for x in trials if not is_needless(x)]
-
-
-def _trials_without_noise(trials: Sequence[_Trial], runner: CallRunner) -> tuple[list[_Trial], list[_Trial]]:
-    """Refit trials without process noise: those with an exact fit, best first, and those without one.
-
-    Trials that are far from the logs with process noise are neither.
-    """
-    good = [x for x in trials if x[1].exact or x[1].is_close]
-    without = drop_process_noise([s for _, s in good if not s.exact], runner)
-    found = [(x, x[1] if x[1].exact else next(without)) for x in good]
-    requests = [(stage.machine, stage, 0.0) for (_, stage), exact in found if exact is None]
-    anew = fit_all_from_start(requests, runner)
-    found = [(x, next(anew) if exact is None else exact) for x, exact in found]
-    found = [(x, None if s is None or _fell_to_zero(x[0].candidate.name, s) else s) for x, s in found]
-    exact = [(score, stage) for (score, _), stage in found if stage is not None]
-    return sorted(exact, key=_information), [x for x, stage in found if stage is None]

@@ -21,10 +21,10 @@ import scipy.stats
 from excite import identification
 from excite.diagnosis.curves import Curve, find_curves
 from excite.diagnosis.deadline import Deadline
-from excite.diagnosis.diagnosis import FORMULA_STD_SHARE, Finding, NearestEffect, ParameterChange
+from excite.diagnosis.diagnosis import FORMULA_STD_SHARE, MIN_EXPLAINED_SHARE, Finding, NearestEffect, ParameterChange
 from excite.diagnosis.hold_out import HoldOutErrors, torque_names
 from excite.diagnosis.score_test import Candidate
-from excite.diagnosis.selection import MIN_EXPLAINED_SHARE, ProgressCallback, identified_entry
+from excite.diagnosis.selection import ProgressCallback, identified_entry
 from excite.diagnosis.torque_fit import LAGS, Term, TorqueFit
 from excite.diagnosis.torque_rows import TorqueRows, torque_rows
 from excite.diagnosis.torque_search import SETTINGS, Search, reason_against, scaled_magnitude

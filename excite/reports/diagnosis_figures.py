@@ -94,11 +94,8 @@ def _draw(place: Path, d: Diagnosis, title: str, kinds: Sequence[str]) -> dict[s
 def _figures(d: Diagnosis, title: str, kinds: Sequence[str]) -> Iterator[tuple[str, Figure]]:
     """Yield some of the figures for every log, each with its file."""
     before, after = d.before, d.after
-    if "when" not in kinds and before.exact != after.exact:
-        # Show forces that one of the two models needs for the other as well.
-        before, after = diagnosis.refit_with_process_noise(before), diagnosis.refit_with_process_noise(after)
     without = diagnosis.residuals_of_logs(before)
-    beside = diagnosis.residuals_of_logs(after) if d.stages else [None] * len(without)
+    beside = diagnosis.residuals_of_logs(after) if d.findings else [None] * len(without)
     draws: dict[str, Callable[..., Figure]] = {
         **KINDS,
         "when": partial(when_figure, words=signal_descriptions(before.machine)),

@@ -16,6 +16,7 @@ from .inverse_chain import torque_sensors as torque_sensors
 from .inverse_fit import InverseFit as InverseFit, InverseSettings as InverseSettings, fit_inverse as fit_inverse
 from .linearisation import (
     BATCH_SIZE as BATCH_SIZE,
+    SLOPES as SLOPES,
     BatchedFunction as BatchedFunction,
     StateSpace as StateSpace,
     build_state_space as build_state_space,
@@ -29,6 +30,7 @@ from .log_fit import (
     apply_step as apply_step,
     fit_logs as fit_logs,
     linearise_logs as linearise_logs,
+    linearise_with as linearise_with,
     newton_step as newton_step,
     prior_information as prior_information,
     prior_terms as prior_terms,
@@ -48,7 +50,12 @@ from .measurements import (
     torque_sensor as torque_sensor,
     transfer_trajectory as transfer_trajectory,
 )
-from .sizes import FitBeside as FitBeside, fit_unknown_forces as fit_unknown_forces, lacks_forces as lacks_forces
+from .sizes import (
+    SIZE_SCATTER as SIZE_SCATTER,
+    FitBeside as FitBeside,
+    fit_unknown_forces as fit_unknown_forces,
+    lacks_forces as lacks_forces,
+)
 from .solver import Settings as Settings
 from .transitions import (
     Transitions as Transitions,
@@ -56,4 +63,11 @@ from .transitions import (
     integrate as integrate,
 )
 from .uncertainty import quantify_uncertainty as quantify_uncertainty
-from .unknown_forces import Missing as Missing, describe_missing as describe_missing
+from .unknown_forces import (
+    Group as Group,
+    Lacking as Lacking,
+    Missing as Missing,
+    UnknownForces as UnknownForces,
+    catalogue as catalogue,
+    describe_missing as describe_missing,
+)

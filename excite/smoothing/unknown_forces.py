@@ -127,6 +127,8 @@ class _Entry:
     period: float = 0.0
 
 
+# Ends of the names of groups whose shapes effects of the catalogue have.
+NAMED = ("late", "with angle", "in braking", "resistance", "scale", "once a turn", "slope")
 SLOWEST_PERIOD_S = 8.0  # of a slow course [s]: longer than a manoeuvre
 
 
@@ -174,9 +176,16 @@ RESISTANCE_SMOOTHING = 0.05  # of the roll's rate [rad/s]
 
 
 def catalogue(
-    space: StateSpace, logs: Sequence[tuple[Measurements, Trajectory]], X: np.ndarray, force_std: np.ndarray
+    space: StateSpace,
+    logs: Sequence[tuple[Measurements, Trajectory]],
+    X: np.ndarray,
+    force_std: np.ndarray,
+    named: bool | None = None,
 ) -> UnknownForces:
-    """Return what each log may lack beside white forces of force_std (n_forces,), with the typical sizes."""
+    """Return what each log may lack beside white forces of force_std (n_forces,), with the typical sizes.
+
+    named: only groups whose shapes effects of the catalogue have, or only the others.
+    """
     speeds, slips = _ranges(space, logs)
     entries = [_entries(space, data, trajectory, X, speeds, slips) for data, trajectory in logs]
     groups, lacking = dict[str, Group](), list[Lacking]()
@@ -184,6 +193,8 @@ def catalogue(
     for own in entries:
         inputs, readings, at = list[Term](), list[Term](), 0
         for e in own:
+            if named is not None and e.name.endswith(NAMED) is not named:
+                continue
             known = groups.get(e.name)
             columns = np.arange(at, at + e.count)
             if known is not None and e.shared:

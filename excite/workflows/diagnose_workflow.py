@@ -202,13 +202,9 @@ def _baseline_note(found: Diagnosis | TorqueDiagnosis) -> list[str]:
             "friction sticks: where a joint is near rest, its friction may have any value up to Fs in the model without"
             " what was found, and up to a tenth of that where presliding was found"
         ]
-    if found.before.estimated:
+    if found.before.exact:
         return []
-    inflation = found.before.data.noise_inflation
-    other = f"fitted to sensors taken for {inflation:g} times as noisy as they are"
-    if not inflation > 1:
-        other = "the machine file's"
-    return [f"no model without what was found follows the log: what is given of the one before is {other}"]
+    return ["no model without what was found follows the log: unknown forces stand beside the one before"]
 
 
 def separating_drive(

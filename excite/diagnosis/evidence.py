@@ -1,0 +1,274 @@
+"""Evidence for effects that a model lacks, beside forces that it lacks without a name.
+
+About a fit, parameters, coefficients of unknown forces and amounts of every candidate form one linear Gaussian model:
+a Gram matrix of whitened innovations. With parameters and offsets integrated out, the marginal likelihood of any set of
+candidates follows from that matrix, with the sizes of the unknown forces at their most likely values. A candidate has
+to explain the logs better than curves and slow courses that mean nothing. Sources: MacKay, "Bayesian interpolation",
+Neural Computation 4, 1992; Kass and Raftery, "Bayes factors", JASA 90, 1995.
+
+A gain is twice the logarithm of a Bayes factor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from excite.diagnosis.parallel import CallRunner, run_in_turn
+from excite.diagnosis.score_test import (
+    MIN_PHASE_SHARE,
+    MIN_SIGNATURE,
+    Candidate,
+    FittedLog,
+    SignatureColumns,
+    renumber_columns,
+)
+from excite.model.effects import Site
+from excite.smoothing import SIZE_SCATTER, Fit, UnknownForces
+
+AMOUNT_STD = 2.0  # prior standard deviation of an amount, over its typical size
+LEVELS = np.linspace(-6.0, 2.0, 9)  # logarithms of the sizes' common level that are tried
+PASSES = 40  # of the fixed point of the sizes
+COMPARING_PASSES = 8  # of it where candidates are compared
+FINALISTS = 8  # candidates that are compared with the sizes renewed
+MIN_ODDS = 20.0  # posterior odds from which a candidate is added, with even odds that some effect is there
+CREDIBLE_ODDS = 20.0  # odds against the best below which a rival stays: the 95 % credible set
+MIN_SHARE = 0.08  # of the first gain in a turn, down to which first-order gains tell causes from errors of the form
+MOST_AT_ONCE = 5  # effects that are added before the model is fitted again
+
+
+@dataclass(frozen=True)
+class Form:
+    """Quadratic form of K parameters and offsets, G coefficients without prior, and C candidate columns.
+
+    information (K + G + C, K + G + C), right_side (K + G + C,): the most likely values solve them. Parameters count
+    from the fit's values, the others from zero. group (G,): of each coefficient. names: of the groups. amount_std (C,):
+    prior standard deviation of each column's factor.
+    """
+
+    information: np.ndarray
+    right_side: np.ndarray
+    outer: int
+    group: np.ndarray
+    names: tuple[str, ...]
+    candidates: tuple[Candidate, ...]
+    amount_std: np.ndarray
+
+    def reduced(self) -> Form:
+        """Return the form with parameters and offsets integrated out."""
+        A, b, o = self.information, self.right_side, slice(0, self.outer)
+        i = slice(self.outer, None)
+        solved = np.linalg.solve(A[o, o], np.column_stack([A[o, i], b[o]]))
+        information = A[i, i] - A[i, o] @ solved[:, :-1]
+        return replace(
+            self, information=(information + information.T) / 2, right_side=b[i] - A[i, o] @ solved[:, -1], outer=0
+        )
+
+    def without(self, at: Sequence[int], value: np.ndarray) -> Form:
+        """Return the form with some parameters (k,) held at a distance `value` (k,) from the fit's values."""
+        keep = np.setdiff1d(np.arange(len(self.right_side)), at)
+        right_side = self.right_side[keep] - self.information[np.ix_(keep, np.asarray(at))] @ value
+        return replace(
+            self, information=self.information[np.ix_(keep, keep)], right_side=right_side, outer=self.outer - len(at)
+        )
+
+    def columns(self, chosen: Sequence[Candidate]) -> np.ndarray:
+        """Return the places of candidates' columns among those of coefficients and candidates."""
+        return len(self.group) + np.array([c for x in chosen for c in x.columns], int)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Logarithms of the most likely sizes (groups,) beside some candidates, gain of all, factors' mean and std."""
+
+    logs: np.ndarray
+    gain: float
+    mean: np.ndarray
+    std: np.ndarray
+
+    def factors(self, form: Form, chosen: Sequence[Candidate]) -> list[np.ndarray]:
+        """Return the factors of each chosen candidate's columns."""
+        ends = np.cumsum([len(x.columns) for x in chosen])
+        return np.split(self.mean[len(form.group) :], ends[:-1])
+
+
+def build_form(
+    along: Sequence[FittedLog],
+    fit: Fit,
+    unknown: UnknownForces,
+    found: Sequence[Candidate],
+    duration: float,
+    runner: CallRunner = run_in_turn,
+) -> Form:
+    """Return the form about a fit without unknown forces but white ones.
+
+    unknown: shapes of what the model may lack, as the last columns of the fitted logs (`score_test.beside`). duration
+    [s]: of the longest log.
+    """
+    found = renumber_columns(found)
+    C, K, count = sum(len(x.columns) for x in found), len(fit.information), unknown.count
+    A, b = np.zeros((K + count + C, K + count + C)), np.zeros(K + count + C)
+    A[:K, :K], b[:K] = fit.information, fit.right_side
+    calls = [partial(_products, log, found) for log in along]
+    logs = zip(runner(calls), fit.indices, unknown.index, strict=True)
+    for gram, own, index in logs:
+        at = np.r_[own, K + index, K + count : K + count + C]
+        e = np.r_[1 : 1 + len(own), len(gram) - C - len(index) : len(gram)]  # data first, a draw of noise may follow
+        new = np.arange(len(at)) >= len(own)
+        block = gram[np.ix_(e, e)]
+        block[: len(own), : len(own)] = 0.0  # in the fit's information
+        A[np.ix_(at, at)] += block
+        b[at[new]] -= gram[0, e[new]]
+    none = np.zeros(0, int)
+    group = np.zeros(count, int)
+    for k, one in enumerate(unknown.groups):
+        group[one.every] = k
+    machine = along[0].space.model.machine
+    std = [
+        AMOUNT_STD
+        * x.placed.effect.typical_magnitude(Site.of(machine, x.placed.bodies, duration))
+        / abs(x.placed.values["A"])
+        for x in found
+        for _ in x.columns
+    ]
+    return Form(A, b, K, group if count else none, tuple(g.name for g in unknown.groups), tuple(found), np.array(std))
+
+
+def _products(log: FittedLog, found: Sequence[Candidate]) -> np.ndarray:
+    return SignatureColumns(log, found).products()
+
+
+def posterior(
+    form: Form, chosen: Sequence[Candidate], logs: np.ndarray | None = None, passes: int = PASSES
+) -> Posterior:
+    """Return the most likely sizes beside some candidates of a reduced form. logs: where the search begins."""
+    G, columns, n = len(form.group), form.columns(chosen), len(form.names)
+    at = np.r_[np.arange(G), columns]
+    information, right_side = form.information[np.ix_(at, at)], form.right_side[at]
+    fixed, count = form.amount_std[columns - G], np.bincount(form.group, minlength=n)
+
+    def solve(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+        size = np.r_[np.exp(logs)[form.group], fixed]
+        whole = size[:, None] * information * size
+        whole[range(len(size)), range(len(size))] += 1
+        inverse, pull = np.linalg.inv(whole), size * right_side
+        mean = inverse @ pull
+        return mean, np.diag(inverse), float(pull @ mean - np.linalg.slogdet(whole)[1]), size
+
+    if logs is None:
+        levels = [np.full(n, level) for level in LEVELS]
+        logs = max(levels, key=lambda x: solve(x)[2])
+    for _ in range(passes if G else 0):
+        mean, variance, _, _ = solve(logs)
+        square = np.bincount(form.group, mean[:G] ** 2, n)
+        determined = count - np.bincount(form.group, variance[:G], n)
+        slope = square - determined - 2 * (logs - logs.mean()) / SIZE_SCATTER**2
+        logs = logs + np.clip(slope / (2 * determined + square + 2 / SIZE_SCATTER**2), -0.7, 0.7)
+    mean, variance, gain, size = solve(logs)
+    scatter = float(np.sum((logs - logs.mean()) ** 2)) / SIZE_SCATTER**2 if G else 0.0
+    return Posterior(logs, gain - scatter, mean * size, np.sqrt(np.maximum(variance, 0)) * size)
+
+
+def first_gains(form: Form, chosen: Sequence[Candidate], logs: np.ndarray) -> np.ndarray:
+    """Return the gain of each candidate beside those chosen, sizes unchanged; -inf where nothing shows it or its sign
+    is impossible."""
+    G, columns = len(form.group), form.columns(chosen)
+    at, every = np.r_[np.arange(G), columns], np.arange(G, len(form.right_side))
+    size = np.r_[np.exp(logs)[form.group], form.amount_std[columns - G]]
+    inner = np.diag(size**-2.0) + form.information[np.ix_(at, at)]
+    solved = np.linalg.solve(inner, np.column_stack([form.information[np.ix_(at, every)], form.right_side[at]]))
+    S = form.information[np.ix_(every, every)] - form.information[np.ix_(every, at)] @ solved[:, :-1]
+    g = form.right_side[every] - form.information[np.ix_(every, at)] @ solved[:, -1]
+    own = np.diag(form.information)[G:]
+    found = np.full(len(form.candidates), -np.inf)
+    for k, x in enumerate(form.candidates):
+        columns = np.array(x.columns)
+        columns = columns[own[columns] > max(MIN_SIGNATURE, MIN_PHASE_SHARE * own[columns].max())]
+        if not len(columns):
+            continue
+        std = form.amount_std[columns]
+        whole = np.eye(len(std)) + std[:, None] * S[np.ix_(columns, columns)] * std
+        step = np.linalg.solve(whole, std * g[columns])
+        if not _is_impossible(x, step * std):
+            found[k] = step @ (std * g[columns]) - np.linalg.slogdet(whole)[1]
+    return found
+
+
+def _is_impossible(x: Candidate, factor: np.ndarray) -> bool:
+    """Tell if a candidate's factor is impossible: of the wrong sign, or beyond the largest amount."""
+    effect = x.placed.effect
+    forward = effect.positive or min(effect.grid) < 0  # if negative amounts are tried, too, a step back is one of those
+    if forward and len(factor) == 1 and factor[0] <= 0:
+        return True
+    return bool(np.hypot.reduce(factor) * abs(x.placed.values["A"]) > 2 * effect.largest)
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Candidates with the factors of their columns, and the gain of each beside those before it.
+
+    left: gain of unknown forces beside them. sizes: of these, over typical, by group.
+    """
+
+    candidates: tuple[Candidate, ...]
+    factors: tuple[np.ndarray, ...]
+    gains: tuple[float, ...]
+    left: float
+    sizes: tuple[float, ...]
+
+
+def least_gain(form: Form) -> float:
+    """Return the gain from which a candidate is added: MIN_ODDS, given the number of names tried."""
+    return float(2 * np.log(MIN_ODDS * max(len({x.name for x in form.candidates}), 1)))
+
+
+def choose(form: Form) -> Chosen:
+    """Add candidates one after the other, the one with the largest gain first, as long as the gain is clear.
+
+    One gain alone counts where later ones are below MIN_SHARE of it: to first order, they may be errors of its form.
+    """
+    form = form.reduced()
+    now = posterior(form, ())
+    left = now.gain
+    chosen, gains = list[Candidate](), list[float]()
+    while len(chosen) < MOST_AT_ONCE:
+        first = first_gains(form, chosen, now.logs)
+        taken = {x.name for x in chosen}
+        finalists = [k for k in _best_of_each_variant(form, first) if form.candidates[k].name not in taken][:FINALISTS]
+        tried = [(k, posterior(form, [*chosen, form.candidates[k]], now.logs, COMPARING_PASSES)) for k in finalists]
+        tried = [
+            (k, p)
+            for k, p in tried
+            if not _is_impossible(form.candidates[k], p.factors(form, [*chosen, form.candidates[k]])[-1])
+        ]
+        if not tried:
+            break
+        k, best = max(tried, key=lambda x: x[1].gain)
+        gain = best.gain - now.gain
+        if gain < max(least_gain(form), MIN_SHARE * gains[0] if gains else 0.0):
+            break
+        chosen.append(form.candidates[k])
+        gains.append(gain)
+        now = posterior(form, chosen, best.logs, COMPARING_PASSES)
+    if chosen:
+        left = now.gain - _gain_alone(form, chosen)
+    return Chosen(
+        tuple(chosen), tuple(now.factors(form, chosen)) if chosen else (), tuple(gains), left, tuple(np.exp(now.logs))
+    )
+
+
+def _gain_alone(form: Form, chosen: Sequence[Candidate]) -> float:
+    """Return the gain of candidates without unknown forces."""
+    return posterior(form, chosen, np.full(len(form.names), -30.0), 0).gain
+
+
+def _best_of_each_variant(form: Form, gains: np.ndarray) -> list[int]:
+    """Return the best candidate of each variant that gains, best first."""
+    best: dict[tuple[str, ...], int] = {}
+    for k in np.argsort(-gains):
+        if gains[k] > 0:
+            best.setdefault(form.candidates[k].variant, int(k))
+    return list(best.values())
