@@ -79,16 +79,12 @@ def evaluate(
     noise = np.broadcast_to(noise, trajectory.torque_error.shape)
     if data.extra_torque_noise is not None:
         noise = np.hypot(noise, data.extra_torque_noise)
-    inputs = space.inputs(delivered, trajectory.ground_inputs)
-    n_f, features = len(space.forces), np.zeros((N, 0))
-    if lacking.count:
-        features = space.features(trajectory.state)[0][:, :, 0]
-        inputs = inputs + lacking.added_inputs(trajectory.lacking, features, space.n_inputs)
+    n_f = len(space.forces)
+    features = space.features(trajectory.state)[0][:, :, 0] if lacking.count else np.zeros((N, 0))
     force_error = np.zeros((N - 1, n_f)) if trajectory.force_error is None else trajectory.force_error
     error = np.concatenate([trajectory.torque_error, force_error], axis=1)
     noise = np.concatenate([noise, np.broadcast_to(lacking.force_std, (N - 1, n_f))], axis=1)
-    added = space.inputs(trajectory.torque_error, np.zeros((N - 1, trajectory.ground_inputs.shape[1])), force_error)
-    left, right = inputs[:-1] + added, inputs[1:] + added
+    left, right = _driving_inputs(space, trajectory, delivered, error, lacking, features)
     steps = integrate(space, trajectory.state, left, right, X)
     defect = np.zeros_like(steps.end) if exact else steps.end - trajectory.state[1:]
     if not np.isfinite(steps.end).all():
@@ -118,24 +114,34 @@ def evaluate(
     )
 
 
-def transitions(space: StateSpace, at: Evaluation, X: np.ndarray) -> TransitionJacobians:
-    """Return the derivatives of all transitions along an evaluated log, at parameters X (n_base,).
-
-    A and B contain what is lacking where it follows the state; X, F and rising do not.
-    """
-    found = differentiate(space, at.steps, X, False, bool(at.lacking.count))
-    A, inverse = close(space, found, feedback_of(space, at))
-    return found if inverse is None else replace(found, A=inverse @ A, B=inverse @ found.B)
+def _driving_inputs(
+    space: StateSpace,
+    trajectory: Trajectory,
+    delivered: np.ndarray,
+    error: np.ndarray,
+    lacking: Lacking,
+    features: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the inputs (N - 1, n_inputs) at both ends of every interval, errors (N - 1, n_e) included."""
+    inputs, n_u = space.inputs(delivered, trajectory.ground_inputs), delivered.shape[1]
+    if lacking.count:
+        inputs = inputs + lacking.added_inputs(trajectory.lacking, features, space.n_inputs)
+    added = space.inputs(error[:, :n_u], np.zeros_like(trajectory.ground_inputs[1:]), error[:, n_u:])
+    return inputs[:-1] + added, inputs[1:] + added
 
 
 def feedback_of(space: StateSpace, at: Evaluation) -> np.ndarray | None:
-    """Return the slopes (N, n_e, core) of what is lacking by the state, None if there are none."""
+    """Return the slopes (2, N - 1, n_e, core) of what is lacking at both ends of every interval by the state there.
+
+    None if there are none.
+    """
     if not at.lacking.count:
         return None
     feedback = at.lacking.feedback(at.trajectory.lacking, at.features, space.n_inputs)
     if feedback is None:
         return None
-    return np.asarray(feedback[:, space.input_columns] @ space.features(at.trajectory.state)[1])
+    by_state = feedback[:, space.input_columns] @ space.features(at.trajectory.state)[1]
+    return np.stack([by_state[:-1], by_state[1:]])
 
 
 def close(
@@ -144,63 +150,56 @@ def close(
     """Return the derivatives A (K, n, n) of K transitions by the first state if inputs at both ends follow the states
     there, and what multiplies them and all others (K, n, n): the last state moves itself, too. None if nothing does.
 
-    feedback (K + 1, n_e, core): slopes of the inputs by the state. It is left out where it makes a motion grow.
+    feedback (2, K, n_e, core): slopes of the inputs at both ends by the state.
     """
     if feedback is None:
         return by.A, None
-    c = space.core
-    first, last = (by.B - by.rising) @ feedback[:-1], by.rising @ feedback[1:]
     A, whole = by.A.copy(), np.broadcast_to(np.eye(space.n), by.A.shape).copy()
-    A[:, :, :c] += first
-    whole[:, :, :c] -= last
-    inverse = np.linalg.inv(whole)
+    A[:, :, : space.core] += (by.B - by.rising) @ feedback[0]
+    whole[:, :, : space.core] -= by.rising @ feedback[1]
+    return A, np.linalg.inv(whole)
+
+
+def without_growth(space: StateSpace, by: TransitionJacobians, feedback: np.ndarray | None) -> np.ndarray | None:
+    """Return the feedback (2, K, n_e, core) of K transitions, zero where it makes a motion grow."""
+    A, inverse = close(space, by, feedback)
+    if feedback is None or inverse is None:
+        return None
+    c = space.core
     alone, together = (np.abs(np.linalg.eigvals(x[:, :c, :c])).max(axis=1) for x in (by.A, inverse @ A))
-    grows = together > np.maximum(alone, 1.0) * np.exp(MAX_GROWTH / float(space.model.machine.sampling_hz))
-    A[grows], inverse[grows] = by.A[grows], np.eye(space.n)
-    return A, inverse
+    stays = together <= np.maximum(alone, 1.0) * np.exp(MAX_GROWTH / float(space.model.machine.sampling_hz))
+    return feedback * stays[:, None, None]
 
 
 MAX_GROWTH = 1.0  # [1/s] that forces may add to a motion: what grows faster over a log can't be smoothed
 
 
-def linearise(
-    space: StateSpace,
-    at: Evaluation,
-    guess: np.ndarray,
-    X: np.ndarray,
-    process_noise: float = 0.0,
-    probe: np.random.Generator | None = None,
-) -> LinearisedLog:
-    """Linearise an evaluated log and integrate out its states.
+def _direct_slopes(space: StateSpace, at: Evaluation, n_p: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the slopes (N, m, n_d) of readings by what they depend on directly, and its columns (n_d,) in a chain."""
+    parameters, readings, shape = list(space.reading_parameters), at.lacking.readings, at.residual.shape
+    seen = sorted({int(c) for term in readings for c in term.columns})
+    by_coefficient = np.zeros((*shape, len(seen)))
+    for term in readings:
+        by_coefficient[:, term.at, [seen.index(c) for c in term.columns]] += term.values(at.features)
+    by_offset = at.D * offset_scale(space, at.data)
+    by_offset = np.broadcast_to(by_offset, (*shape, by_offset.shape[-1]))
+    offsets = 1 + n_p + at.lacking.count + np.arange(by_offset.shape[-1])
+    columns = np.concatenate([1 + np.array(parameters, int), 1 + n_p + np.array(seen, int), offsets])
+    slopes = at.reading_slopes * space.model.scale[parameters]
+    return np.concatenate([slopes, by_coefficient, by_offset], axis=2), columns
 
-    probe: draws of white errors and readings' noise; what they would leave becomes a last column of Z and the chain.
-    """
+
+def linearise(
+    space: StateSpace, at: Evaluation, guess: np.ndarray, X: np.ndarray, process_noise: float = 0.0
+) -> LinearisedLog:
+    """Linearise an evaluated log and integrate out its states."""
     data, trajectory, lacking = at.data, at.trajectory, at.lacking
-    scale, n_p, n_o = state_scale(space), len(X), len(data.offset_sensors)
-    n_c = lacking.count
-    N, n_u = len(trajectory.state), data.torque.shape[1]
-    count = 1 + n_p + n_c + n_o
-    total = count + (probe is not None)
-    S, offset_unit = at.H * scale, offset_scale(space, data)
-    slopes = at.reading_slopes * space.model.scale[list(space.reading_parameters)]
-    seen = sorted({int(c) for term in lacking.readings for c in term.columns})
-    # Columns that act on readings directly.
-    columns = np.concatenate(
-        [1 + np.array(space.reading_parameters, int), 1 + n_p + np.array(seen, int), np.arange(1 + n_p + n_c, count)]
-    )
-    by_reading = np.zeros((N, at.residual.shape[1], len(seen)))
-    for term in lacking.readings:
-        by_reading[:, term.at, [seen.index(c) for c in term.columns]] += term.values(at.features)
-    direct = np.concatenate(
-        [slopes, by_reading, np.broadcast_to(at.D * offset_unit, (*at.residual.shape, n_o))], axis=2
-    )
-    noisy = np.sqrt(at.weight) * probe.standard_normal(at.weight.shape) if probe is not None else None
-    drawn = probe.standard_normal(at.noise.shape) if probe is not None else None
-    first = np.zeros((1, space.n, total))
+    scale, n_p, n_u, N = state_scale(space), len(X), data.torque.shape[1], len(trajectory.state)
+    count = 1 + n_p + lacking.count + len(data.offset_sensors)
+    S, (direct, columns) = at.H * scale, _direct_slopes(space, at, n_p)
+    first = np.zeros((1, space.n, count))
     first[0, :, 0] = (guess - trajectory.state[0]) / scale
     std = initial_std(space) / scale
-    if probe is not None:
-        first[0, :, -1] = std * probe.standard_normal(space.n)
     zero = np.zeros((1, space.n, space.n))
     sections = [
         parallel_smoother.combine(
@@ -212,11 +211,9 @@ def linearise(
 
     def readings(part: slice) -> tuple[np.ndarray, np.ndarray]:
         weighted = (S[part] * at.weight[part][:, :, None]).transpose(0, 2, 1)
-        eta = np.zeros((part.stop - part.start, space.n, total))
+        eta = np.zeros((part.stop - part.start, space.n, count))
         eta[:, :, 0] = (weighted @ at.residual[part][:, :, None])[:, :, 0]
         eta[:, :, columns] = -(weighted @ direct[part])
-        if noisy is not None:
-            eta[:, :, -1] = (S[part].transpose(0, 2, 1) @ noisy[part][:, :, None])[:, :, 0]
         return weighted @ S[part], eta
 
     terms = [(t.columns, list(space.input_columns).index(t.at), t.values(at.features)) for t in lacking.inputs]
@@ -224,10 +221,11 @@ def linearise(
     for begin in range(0, N - 1, BATCH_SIZE):
         end = min(begin + BATCH_SIZE, N - 1)
         by = differentiate(space, at.steps.between(begin, end), X, process_noise > 0, bool(lacking.count))
-        A, inverse = close(space, by, None if feedback is None else feedback[begin : end + 1])
+        own_feedback = without_growth(space, by, None if feedback is None else feedback[:, begin:end])
+        A, inverse = close(space, by, own_feedback)
         A = A * (scale / scale[:, None])
         gain = by.B[:, :, acting] * at.noise[begin:end, None, acting] / scale[:, None]
-        b = np.zeros((end - begin, space.n, total))
+        b = np.zeros((end - begin, space.n, count))
         relative_error = at.error[begin:end, acting] / at.noise[begin:end, acting]
         b[:, :, 0] = at.defect[begin:end] / scale - (gain @ relative_error[:, :, None])[:, :, 0]
         b[:, :, 1 : 1 + n_p] = (by.X + by.B[:, :, :n_u] @ at.behind[begin:end]) * (space.model.scale / scale[:, None])
@@ -235,8 +233,6 @@ def linearise(
             at_start, at_end = values[begin:end, None, :], values[begin + 1 : end + 1, None, :]
             change = by.B[:, :, j, None] * at_start + by.rising[:, :, j, None] * (at_end - at_start)
             b[:, :, 1 + n_p + own] += change / scale[:, None]
-        if drawn is not None:
-            b[:, :, -1] = (gain @ drawn[begin:end, acting, None])[:, :, 0]
         process = np.zeros((end - begin, space.n, 0))
         if process_noise > 0:
             process = by.F * (process_noise * PROCESS_NOISE_UNIT * space.forced_inertia) / scale[:, None]
@@ -260,13 +256,9 @@ def linearise(
     sections.append(parallel_smoother.combine(stages[-1]))
     chain = parallel_smoother.smooth_chain(sections)
     root = np.sqrt(at.weight)
-    parts = [(at.residual * root)[:, :, None], -direct * root[:, :, None]]
     where = np.concatenate([[0], columns])
-    if noisy is not None:
-        unit = np.divide(noisy, root, out=np.zeros_like(noisy), where=root > 0)
-        parts.append(unit[:, :, None])
-        where = np.append(where, total - 1)
-    flat = np.concatenate(parts, axis=2).reshape(-1, len(where))
+    flat = np.concatenate([(at.residual * root)[:, :, None], -direct * root[:, :, None]], axis=2)
+    flat = flat.reshape(-1, len(where))
     Z = chain.Z.copy()
     Z[np.ix_(where, where)] += flat.T @ flat
     return LinearisedLog(
@@ -285,6 +277,50 @@ def linearise(
         np.concatenate(processes) if processes else None,
         np.concatenate(inverses) if inverses else None,
     )
+
+
+DETERMINANT_STEP = 1e-3  # of a parameter over its scale, for the difference quotient of transitions
+DETERMINANT_TRANSITIONS = 1500  # of a log, of which difference quotients are taken: neighbours change alike
+
+
+def log_variance_slope(
+    space: StateSpace, at: Evaluation, linear: LinearisedLog, X: np.ndarray, free: np.ndarray
+) -> np.ndarray:
+    """Return the slope of `innovations.log_variance` by the scaled parameters (n_base,), zero where not free (n_base,).
+
+    The covariance P' = A P A' + B Q B' that a transition predicts, P from all readings before, changes the determinant
+    by the trace of N dP', where N is the covariance of the multiplier after it.
+    """
+    scale, K = state_scale(space), len(at.defect)
+    places = np.arange(0, K, max(1, K // DETERMINANT_TRANSITIONS))
+    A, J = (np.concatenate([getattr(x, name) for x in linear.elements])[:-1] for name in ("A", "J"))
+    P, N = linear.moments
+    by_A = 2 * (N @ A @ parallel_smoother.shrink(P[:-1], J)) * (scale / scale[:, None])
+    by_B = 2 * (N @ linear.gain) * linear.noise[:, None] / scale[:, None]
+    by_A, by_B = (np.add.reduceat(x, places) for x in (by_A, by_B))
+    state = at.trajectory.state[np.append(places, -1)]
+    feedback = feedback_of(space, at)
+    feedback = None if feedback is None else feedback[:, places]
+
+    def transitions(X: np.ndarray) -> TransitionJacobians:
+        delivered = space.delivered_torques(at.data.torque, X, at.trajectory.torque_error)[0]
+        left, right = _driving_inputs(space, at.trajectory, delivered, at.error, at.lacking, at.features)
+        steps = integrate(space, state, left[places], right[places], X)
+        return differentiate(space, steps, X, False, feedback is not None)
+
+    def value(X: np.ndarray) -> float:
+        by = transitions(X)
+        A, inverse = close(space, by, feedback)
+        A, B = (A, by.B) if inverse is None else (inverse @ A, inverse @ by.B)
+        return float(np.sum(by_A * A) + np.sum(by_B * B[:, :, linear.acting]))
+
+    feedback = without_growth(space, transitions(X), feedback)
+    here, found = value(X), np.zeros(len(X))
+    for k in np.flatnonzero(free):
+        moved = X.copy()
+        moved[k] += DETERMINANT_STEP * space.model.scale[k]
+        found[k] = (value(moved) - here) / DETERMINANT_STEP
+    return found
 
 
 @dataclass(frozen=True)
@@ -339,8 +375,7 @@ def move(
     data: Measurements,
 ) -> Trajectory:
     """Return the trajectory after a scaled step of all unknowns to parameters X, with its most likely states."""
-    probe = len(linear.chain.Z) - 1 - len(step)
-    x, slope = linear.chain.states(np.concatenate([step, np.zeros(probe)]))
+    x, slope = linear.chain.states(step)
     e = (linear.gain.transpose(0, 2, 1) @ slope[1:, :, None])[:, :, 0] * linear.noise
     n_u, n_o = data.torque.shape[1], len(data.offset_sensors)
     n_c = lacking.count

@@ -75,6 +75,16 @@ class LinearisedLog:
         return innovations(self)
 
     @cached_property
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Covariances of the states from all readings before (N, n, n), and of the multipliers after the transitions.
+
+        A multiplier (N - 1 in all) scatters with J (I + P J)^-1, where J is the information about the state after the
+        transition from all readings there and later, and a smoothed white error is gain' times it.
+        """
+        P, J = self.chain.moments()
+        return P, parallel_smoother.shrink(J[1:], P[1:])
+
+    @cached_property
     def filter(self) -> list[FilterStep]:
         """Steps of the Kalman filter along the log."""
         return filter_steps(self)
@@ -98,6 +108,11 @@ def log_variance(linear: LinearisedLog) -> float:
     """Return the logarithm of the determinant of the covariance of all innovations of a log [SI]."""
     diagonals = [(step.whitening, step.used) for step in linear.filter]
     return -2 * sum(float(np.log(np.diagonal(w, axis1=1, axis2=2)[used]).sum()) for w, used in diagonals)
+
+
+def expected_squares(linear: LinearisedLog) -> np.ndarray:
+    """Return the sum over a log of the expected square of each smoothed white error (n_e,), of unit variance."""
+    return np.asarray(np.sum(linear.gain * (linear.moments[1] @ linear.gain), axis=(0, 1)))
 
 
 def innovation_statistics(linear: LinearisedLog) -> np.ndarray:

@@ -49,7 +49,7 @@ class Fit:
     trajectories, linear: of each log. process_noise: level, in units of `forward.PROCESS_NOISE_UNIT`. status, step
     [standard deviations], history: see `solver.Solution`. unknown: what the model lacks. information: of all unknowns,
     scaled; right_side: information times the most likely values, where parameters count from X and coefficients from
-    zero. determinant: of a probed fit.
+    zero.
     """
 
     X: np.ndarray
@@ -66,7 +66,6 @@ class Fit:
     unknown: UnknownForces
     information: np.ndarray
     right_side: np.ndarray
-    determinant: Determinant | None = None
 
     @property
     def std(self) -> np.ndarray:
@@ -145,6 +144,19 @@ class Determinant:
         return curvature / 2, self.slope * ratio / 2, float(self.slope @ cost)
 
 
+def log_determinant(
+    space: StateSpace, measurements: Sequence[Measurements], starts: Sequence[Trajectory], fit: Fit
+) -> Determinant:
+    """Return the log determinant of all innovations' covariance about a fit, its coefficients held."""
+    slope = np.zeros(len(fit.X))
+    logs = zip(measurements, fit.trajectories, starts, fit.unknown.lacking, fit.linear, strict=True)
+    for data, trajectory, start, lacking, linear in logs:
+        at = forward.evaluate(space, data, trajectory, start.state[0], fit.X, lacking)
+        assert at is not None  # the fit ended there
+        slope += forward.log_variance_slope(space, at, linear, fit.X, ~fit.unidentifiable)
+    return Determinant(slope, fit.X)
+
+
 @dataclass(frozen=True)
 class Point:
     """Parameters X (n_base,) [SI] and the trajectories of all logs."""
@@ -153,16 +165,12 @@ class Point:
     trajectories: tuple[Trajectory, ...]
 
 
-DETERMINANT_STEP = 1e-3  # of a parameter over its scale, for the difference quotient of transitions
-
-
 @dataclass
 class LogProblem:
     """Logs as a least-squares problem (`solver.Problem`).
 
     prior (n_base,): information about the machine file's values, scaled. held (n_base,): parameters that stay there.
-    probed: whether a draw of all noise is carried along, see `forward.linearise`. pull: log determinant of the
-    innovations, which belongs to twice the negative log-likelihood.
+    pull: log determinant of the innovations, which belongs to twice the negative log-likelihood.
     """
 
     space: StateSpace
@@ -172,7 +180,6 @@ class LogProblem:
     held: np.ndarray
     process_noise: float
     unknown: UnknownForces
-    probed: bool = False
     pull: Determinant | None = None
     point: Point = field(init=False)
     evaluations: list[Evaluation] = field(init=False)
@@ -238,23 +245,15 @@ class LogProblem:
         X = self.point.X
         try:
             linear = tuple(
-                forward.linearise(
-                    self.space,
-                    e,
-                    start.state[0],
-                    X,
-                    self.process_noise,
-                    np.random.default_rng(k) if self.probed else None,
-                )
-                for k, (e, start) in enumerate(zip(self.evaluations, self.starts, strict=True))
+                forward.linearise(self.space, e, start.state[0], X, self.process_noise)
+                for e, start in zip(self.evaluations, self.starts, strict=True)
             )
         except np.linalg.LinAlgError:  # the chain is numerically singular this far off
             return None
         information, slope, cost = self.beside_logs()
         for log, own in zip(linear, self.indices, strict=True):
-            k = slice(1, 1 + len(own))
-            information[np.ix_(own, own)] += log.Z[k, k]
-            slope[own] += log.Z[k, 0]
+            information[np.ix_(own, own)] += log.Z[1:, 1:]
+            slope[own] += log.Z[1:, 0]
             cost += float(log.Z[0, 0])
         lost = any(log.Z[0, 0] < 0 for log in linear)  # a sum of squares: rounding has taken over
         if lost or not (np.isfinite(information).all() and (np.diag(information) > 0).all()):
@@ -283,7 +282,7 @@ class LogProblem:
             return np.diagonal(self.space.pivots(where, X)[0][:, :, 0])
 
         here = smallest(X)
-        step = DETERMINANT_STEP * model.scale
+        step = forward.DETERMINANT_STEP * model.scale
         slopes = np.array([(smallest(X + d) - here) for d in np.diag(step)]).T / step
         values = np.concatenate([X[free], -self.space.soil @ X, here - self.least_pivots])
         return values, np.vstack([np.eye(len(X))[free], -self.space.soil, slopes])
@@ -293,7 +292,7 @@ class LogProblem:
         self.process = [forward.process_noise_of(log) for log in self.linear]
         new = []
         for log, own in zip(self.linear, self.indices, strict=True):
-            multiplier = log.chain.states(self._with_probe(log, step[own]))[1][1:]
+            multiplier = log.chain.states(step[own])[1][1:]
             if log.closing is not None:
                 multiplier = (log.closing.transpose(0, 2, 1) @ multiplier[:, :, None])[:, :, 0]
             multiplier = 2 * np.abs(multiplier)
@@ -326,38 +325,6 @@ class LogProblem:
 
         return path
 
-    def determinant(self) -> Determinant:
-        """Return the log determinant of all innovations' covariance about the current parameters.
-
-        Data drawn from the model have the score zero on average, so the drawn errors, states and multipliers give the
-        slope: 2 sum l' (dA x + dB e). Of the derivatives of the transitions these are difference quotients.
-        """
-        model, scale = self.space.model, forward.state_scale(self.space)
-        found = np.zeros(len(self.prior))
-        for log, e in zip(self.linear, self.evaluations, strict=True):
-            drawn = np.zeros(len(log.Z))
-            drawn[-1] = 1.0
-            states, slopes = log.chain.response(drawn)
-            x, multiplier = states[:-1] * scale, slopes[1:] / scale
-            errors = np.zeros((len(x), e.noise.shape[1]))
-            errors[:, log.acting] = (log.gain.transpose(0, 2, 1) @ slopes[1:, :, None])[:, :, 0] * log.noise
-
-            def response(
-                X: np.ndarray, at: Evaluation = e, x: np.ndarray = x, errors: np.ndarray = errors
-            ) -> np.ndarray:
-                J = forward.transitions(self.space, at, X)
-                return np.asarray((J.A @ x[:, :, None] + J.B @ errors[:, :, None])[:, :, 0])
-
-            here = response(self.point.X)
-            for k in np.flatnonzero(~self.held):
-                X = self.point.X.copy()
-                X[k] += DETERMINANT_STEP * model.scale[k]
-                found[k] += 2 * float(np.sum(multiplier * (response(X) - here))) / DETERMINANT_STEP
-        return Determinant(found, self.point.X)
-
-    def _with_probe(self, log: LinearisedLog, step: np.ndarray) -> np.ndarray:
-        return np.concatenate([step, np.zeros(len(log.Z) - 1 - len(step))])
-
 
 def fit_logs(
     space: StateSpace,
@@ -369,14 +336,13 @@ def fit_logs(
     process_noise: float = 0.0,
     settings: Settings = DEFAULT,
     unknown: UnknownForces | None = None,
-    probed: bool = False,
     pull: Determinant | None = None,
 ) -> Fit:
     """Find the most likely parameters and trajectories of logs; the fit has a status.
 
     trajectories, X (n_base,): where the iteration starts. starts: trajectories whose first states are the prior means
     of the first states. held (n_base,): parameters that stay at the machine file's values. unknown: forces beside the
-    model, of given sizes. probed, pull: see `LogProblem`.
+    model, of given sizes. pull: see `LogProblem`.
     """
     unknown = no_unknown_forces(space, len(measurements)) if unknown is None else unknown
     X = np.where(held, space.model.nominal, X)
@@ -386,7 +352,7 @@ def fit_logs(
         at = Point(np.where(fixed, space.model.nominal, at.X), at.trajectories)
         prior = prior_information(space.model, fixed, at.X)
         own = None if pull is None else replace(pull, slope=np.where(fixed, 0.0, pull.slope))
-        problem = LogProblem(space, measurements, starts, prior, fixed, process_noise, unknown, probed, own)
+        problem = LogProblem(space, measurements, starts, prior, fixed, process_noise, unknown, own)
         return problem, solver.minimise(problem, at, how)
 
     fixed, history = held, tuple[tuple[float, float], ...]()
@@ -457,7 +423,6 @@ def _as_fit(
         problem.unknown,
         information,
         right_side,
-        problem.determinant() if problem.probed and solution.quadratic is not None else None,
     )
 
 

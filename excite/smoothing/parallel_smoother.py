@@ -14,12 +14,13 @@ b and eta have c columns: the data, then the slopes by parameters shared by all 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 FIELDS = ("A", "b", "C", "eta", "J")
+Pair = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -57,24 +58,52 @@ class CombinedElements:
     total: Elements
     levels: tuple[_CombinationLevel, ...]
 
-    def states_between(self, weights: np.ndarray, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def states_between(self, weights: np.ndarray, left: np.ndarray, right: np.ndarray) -> Pair:
         """States and slopes (K - 1, n, w) between the elements.
 
         weights (c, w): of the columns. left (n, w): state before the first element. right (n, w): slope after the last.
         """
+
+        def middle(level: _CombinationLevel, before: np.ndarray, after: np.ndarray) -> Pair:
+            first, second = level.first, level.second
+            slope = second.A.transpose(0, 2, 1) @ after + second.eta @ weights
+            state = level.G @ (first.A @ before + first.b @ weights + first.C @ slope)
+            return state, slope - second.J @ state
+
+        return self._between(middle, left, right)
+
+    def moments_between(self, left: np.ndarray, right: np.ndarray) -> Pair:
+        """Covariances given all stages before, and information from all stages after (K - 1, n, n), of the states.
+
+        left (n, n): covariance before the first element. right (n, n): information after the last.
+        """
+
+        def middle(level: _CombinationLevel, before: np.ndarray, after: np.ndarray) -> Pair:
+            first, second = level.first, level.second
+            ahead = first.A @ shrink(before, first.J) @ first.A.transpose(0, 2, 1) + first.C
+            return ahead, second.A.transpose(0, 2, 1) @ shrink(after, second.C) @ second.A + second.J
+
+        return self._between(middle, left, right)
+
+    def _between(
+        self, middle: Callable[[_CombinationLevel, np.ndarray, np.ndarray], Pair], left: np.ndarray, right: np.ndarray
+    ) -> Pair:
+        """Values before and after the states between the elements, from those at both ends, level by level."""
         before_all, after_all = left[None], right[None]
         for level in reversed(self.levels):
             pairs = len(level.G)
-            first, second = level.first, level.second
-            after = second.A.transpose(0, 2, 1) @ after_all[:pairs] + second.eta @ weights
-            state = level.G @ (first.A @ before_all[:pairs] + first.b @ weights + first.C @ after)
-            before, behind = np.empty((2, level.count, *left.shape))
-            before[0 : 2 * pairs : 2], before[1 : 2 * pairs : 2] = before_all[:pairs], state
-            behind[0 : 2 * pairs : 2], behind[1 : 2 * pairs : 2] = after - second.J @ state, after_all[:pairs]
+            before, after = np.empty((2, level.count, *left.shape))
+            before[0 : 2 * pairs : 2], after[1 : 2 * pairs : 2] = before_all[:pairs], after_all[:pairs]
+            before[1 : 2 * pairs : 2], after[0 : 2 * pairs : 2] = middle(level, before_all[:pairs], after_all[:pairs])
             if level.count % 2:
-                before[-1], behind[-1] = before_all[-1], after_all[-1]
-            before_all, after_all = before, behind
+                before[-1], after[-1] = before_all[-1], after_all[-1]
+            before_all, after_all = before, after
         return before_all[1:], after_all[:-1]
+
+
+def shrink(P: np.ndarray, J: np.ndarray) -> np.ndarray:
+    """Return P (I + J P)^-1 (K, n, n): a covariance P after information J, or information P seen through noise J."""
+    return np.asarray(np.linalg.solve(np.eye(P.shape[-1]) + P @ J, P))
 
 
 @dataclass(frozen=True)
@@ -99,29 +128,32 @@ class SmoothedChain:
 
         The random part e of a stage is C times the slope after it.
         """
-        return self.response(np.concatenate([[1.0], p]))
-
-    def response(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """States and slopes (K - 1, n) for weights (c,) of the columns: the data, parameter steps, others."""
-        states, slopes = self._states_for(weights[:, None])
+        states, slopes = self._states_for(np.concatenate([[1.0], p])[:, None])
         return states[:, :, 0], slopes[:, :, 0]
 
     def slopes(self, of: slice) -> np.ndarray:
         """Derivatives of the most likely states by some of the parameters (K - 1, n, w)."""
         return self._states_for(np.eye(len(self.Z))[:, 1:][:, of])[0]
 
-    def _states_for(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def moments(self) -> Pair:
+        """Covariances given all stages before, and information from all stages after (K - 1, n, n), of the states."""
+        zero = np.zeros_like(self.top.total.A[0])
+        return self._between(CombinedElements.moments_between, zero)
+
+    def _states_for(self, weights: np.ndarray) -> Pair:
         """Most likely states and slopes (K - 1, n, w) for weights (c, w) of the columns of b and eta."""
         zero = np.zeros((self.top.total.A.shape[1], weights.shape[1]))
-        inner = self.top.states_between(weights, zero, zero)
-        before, behind = np.concatenate([zero[None], inner[0]]), np.concatenate([inner[1], zero[None]])
-        states: list[np.ndarray] = []
-        slopes: list[np.ndarray] = []
-        for part, left, right in zip(self.parts, before, behind, strict=True):
-            state, slope = part.states_between(weights, left, right)
-            states += [left[None], state]
-            slopes += [slope, right[None]]
-        return np.concatenate(states[1:]), np.concatenate(slopes[:-1])
+        return self._between(lambda part, left, right: part.states_between(weights, left, right), zero)
+
+    def _between(self, within: Callable[[CombinedElements, np.ndarray, np.ndarray], Pair], zero: np.ndarray) -> Pair:
+        inner = within(self.top, zero, zero)
+        before, after = np.concatenate([zero[None], inner[0]]), np.concatenate([inner[1], zero[None]])
+        left, right = list[np.ndarray](), list[np.ndarray]()
+        for part, first, last in zip(self.parts, before, after, strict=True):
+            own = within(part, first, last)
+            left += [first[None], own[0]]
+            right += [own[1], last[None]]
+        return np.concatenate(left[1:]), np.concatenate(right[:-1])
 
 
 def smooth_chain(parts: Sequence[CombinedElements]) -> SmoothedChain:

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from excite.smoothing.innovations import whiten
+from excite.smoothing.innovations import expected_squares, whiten
 from excite.smoothing.linearisation import StateSpace
-from excite.smoothing.log_fit import Fit, fit_logs, linearise_with
+from excite.smoothing.log_fit import Fit, fit_logs, linearise_with, log_determinant
 from excite.smoothing.measurements import Measurements, Trajectory
 from excite.smoothing.solver import Settings, inverse
 from excite.smoothing.unknown_forces import UnknownForces, catalogue
@@ -72,15 +72,13 @@ def fit_unknown_forces(
             trajectories = _without_coefficients(trajectories, unknown)
         else:
             unknown = replace(unknown, size=size)
-        latest = fit_logs(
-            space, logs, trajectories, X, starts, held, settings=settings, unknown=unknown, probed=True, pull=pull
-        )
+        latest = fit_logs(space, logs, trajectories, X, starts, held, settings=settings, unknown=unknown, pull=pull)
         unmoved = any(t.force_error is None for t in latest.trajectories)
         lost = unmoved or not latest.linear or not latest.cost > 0
         fit = latest if fit is None or not lost else fit
         if lost:
             break
-        pull = fit.determinant
+        pull = log_determinant(space, logs, starts, fit)
         X, trajectories, found = fit.X, fit.trajectories, find_sizes(fit)[0].size
         size = np.maximum(found, SLOWEST_SHRINKING * unknown.size)
         ratio = white_noise_ratios(fit)
@@ -195,18 +193,10 @@ def _integrate_out_parameters(fit: Fit) -> _Coefficients:
 
 
 def white_noise_ratios(fit: Fit) -> np.ndarray:
-    """Return the mean square of each white error, torques then forces with a size, over what a right model leaves.
-
-    The fit must be probed: what a draw of all noise leaves is the expectation.
-    """
-    slope = np.zeros(len(fit.right_side))
-    for log, own in zip(fit.linear, fit.indices, strict=True):
-        slope[own] += log.Z[1:-1, -1]
-    step = -np.linalg.solve(fit.information, slope)
-    found, expected = 0.0, 0.0
-    for log, own, trajectory in zip(fit.linear, fit.indices, fit.trajectories, strict=True):
-        multipliers = log.chain.response(np.concatenate([[0.0], step[own], [1.0]]))[1][1:]
-        drawn = (log.gain.transpose(0, 2, 1) @ multipliers[:, :, None])[:, :, 0]
+    """Return the mean square of each white error, torques then forces with a size, over what a right model leaves."""
+    found, expected = np.zeros((2, len(fit.linear[0].acting)))
+    for log, trajectory in zip(fit.linear, fit.trajectories, strict=True):
         error = np.concatenate([trajectory.torque_error, trajectory.force_error], axis=1)[:, log.acting] / log.noise
-        found, expected = found + np.sum(error**2, axis=0), expected + np.sum(drawn**2, axis=0)
+        found += np.sum(error**2, axis=0)
+        expected += expected_squares(log)
     return np.asarray(found / np.maximum(expected, np.finfo(float).tiny))
