@@ -235,6 +235,7 @@ def choose(form: Form) -> Chosen:
     left = now.gain
     chosen, gains = list[Candidate](), list[float]()
     while len(chosen) < MOST_AT_ONCE:
+        now = _exchanged(form, chosen, now)
         first = first_gains(form, chosen, now.logs)
         taken = {x.name for x in chosen}
         finalists = [k for k in _best_of_each_variant(form, first) if form.candidates[k].name not in taken][:FINALISTS]
@@ -258,6 +259,25 @@ def choose(form: Form) -> Chosen:
     return Chosen(
         tuple(chosen), tuple(now.factors(form, chosen)) if chosen else (), tuple(gains), left, tuple(np.exp(now.logs))
     )
+
+
+def _exchanged(form: Form, chosen: list[Candidate], now: Posterior) -> Posterior:
+    """Exchange chosen candidates, in place, for others that gain more beside the rest."""
+    for k in range(len(chosen)):
+        others = [*chosen[:k], *chosen[k + 1 :]]
+        taken = {x.name for x in others}
+        best = _best_of_each_variant(form, first_gains(form, others, now.logs))
+        best = [j for j in best if form.candidates[j].name not in taken][:1]
+        if not best or form.candidates[best[0]] is chosen[k]:
+            continue
+        other = [*chosen[:k], form.candidates[best[0]], *chosen[k + 1 :]]
+        found = posterior(form, other, now.logs, COMPARING_PASSES)
+        if found.gain > now.gain + EXCHANGE_GAIN:
+            chosen[k], now = form.candidates[best[0]], found
+    return now
+
+
+EXCHANGE_GAIN = 1.0  # by which another candidate must be better to take a chosen one's place
 
 
 def _gain_alone(form: Form, chosen: Sequence[Candidate]) -> float:

@@ -47,6 +47,7 @@ IMPOSSIBLE_SIGN_STDS = 3.0  # standard deviations beyond zero from which a param
 IMPOSSIBLE_SIGN_SHARE = 0.5  # share of the parameter's scale beyond zero, likewise; chosen
 FROM_START = Settings(20, tolerance=0.3)  # of a fit from the filtered log
 RESUMED = Settings(14, 0.25, tolerance=0.3)  # of a fit that continues another
+COMPARED = Settings(9, 0.25, tolerance=0.5)  # of one that is compared with it
 # Rounds of a fit beside unknown forces: parameters stay near their first values, as shapes and sizes come first.
 ROUNDS_BESIDE = (Settings(6, 1e4, 1.0, tolerance=0.3), Settings(6, 1e3, 0.3, tolerance=0.3))
 
@@ -345,7 +346,7 @@ def refit_all(
 
 def _follow_or_none(data: FitData, trajectories: Sequence[Trajectory], X: np.ndarray) -> Fitted | None:
     try:
-        return _follow(data, trajectories, X, RESUMED, True)
+        return _follow(data, trajectories, X, COMPARED, True)
     except NotConvergedError:
         return None
 

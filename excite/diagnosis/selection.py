@@ -33,7 +33,7 @@ MAX_TURNS = 8  # of choosing and fitting again; chosen
 FORMULA_ERROR = 0.03  # relative difference of two formulas of one effect: 1 to 6 % in results/diagnosis
 MAX_FORMULA_RATIO = 250.0  # largest likelihood ratio that the error of a formula makes; chosen
 # Of an effect's gain, that another in its place may lose to first order to be fitted there; chosen.
-RIVAL_LOSS, RIVAL_LOSS_SHARE = 20.0, 0.15
+RIVAL_LOSS, RIVAL_LOSS_SHARE = 20.0, 0.05
 MAX_RIVALS = 3  # that are fitted in the place of an effect; chosen
 REFINEMENT_REACHES = 1.0, 0.35  # shares of the way to the next trial values, refined in turn; chosen
 TIME_TRIAL_SHARE = 12  # duration over the distance of refined trial instants: a grid of quarters, in thirds
@@ -81,7 +81,7 @@ def search(before: ExtendedFit, runner: CallRunner, report: ProgressCallback, de
     if before.data.sticks:
         report(0.1, "fitting friction near rest")
         stage = _with_presliding(before, runner)
-    n_candidates = 1
+    n_candidates, without = 1, dict[str, ExtendedFit | None]()
     for turn in range(MAX_TURNS):
         report(0.1 + 0.1 * turn, "scoring effects")
         wanted = [x for x in candidates_of(stage) if x.name not in dropped]
@@ -91,20 +91,25 @@ def search(before: ExtendedFit, runner: CallRunner, report: ProgressCallback, de
         if len(stage.model.effects) + len(found.candidates) > MAX_EFFECTS + len(before.model.effects):
             found = _first_of(found, MAX_EFFECTS + len(before.model.effects) - len(stage.model.effects))
         if not found.candidates or deadline.is_over():
-            pruned = stage if deadline.is_over() else _without_needless(before, stage, runner, dropped)
-            if pruned is stage:
+            if deadline.is_over():
                 break
-            stage = pruned
+            report(0.2 + 0.1 * turn, "testing each effect given the others")
+            without = _fits_without(before, stage, runner)
+            needless = _needless(stage, without)
+            if needless is None:
+                break
+            dropped[needless] = "the other effects replace it"
+            stage = refit(_without(stage, [needless]), stage)
             continue
         found = _refined(stage, found, runner)
         report(0.15 + 0.1 * turn, "fitting effects")
         machine = effects.with_effects(stage.machine, *entries(found))
         try:
-            stage = _without_impossible(before, refit(machine, stage), dropped)
+            stage = _without_idle(before, refit(machine, stage), dropped)
         except NotConvergedError:
             break
-    report(0.85, "testing each effect given the others")
-    stage, choices = _judged(before, stage, runner, n_candidates, deadline)
+    report(0.85, "comparing rivals")
+    stage, choices = _judged(before, stage, without, runner, deadline)
     return Search(stage, choices, found.left, n_candidates, dropped)
 
 
@@ -119,7 +124,7 @@ def give_up(
     form = stage.form(candidates_of(stage), runner)
     left = evidence.posterior(form.reduced(), ()).gain
     n_candidates = len({x.name for x in form.candidates})
-    stage, choices = _judged(before, stage, runner, n_candidates, deadline)
+    stage, choices = _judged(before, stage, _fits_without(before, stage, runner), runner, deadline)
     return Search(stage, choices, left, n_candidates, dict(reasons))
 
 
@@ -259,64 +264,73 @@ def _without(stage: ExtendedFit, names: Sequence[str]) -> Machine:
     return machine
 
 
-def _without_impossible(before: ExtendedFit, stage: ExtendedFit, dropped: dict[str, str]) -> ExtendedFit:
-    """Return a fit without effects whose magnitudes fell to zero or that no machine has. Raises NotConvergedError."""
-    while names := [n for n in added(before, stage) if _fell_to_zero(n, stage) or not is_plausible(n, stage)]:
+def _without_idle(before: ExtendedFit, stage: ExtendedFit, dropped: dict[str, str]) -> ExtendedFit:
+    """Return a fit without effects whose magnitudes are about zero or that no machine has. Raises NotConvergedError."""
+    while names := [n for n in added(before, stage) if _is_idle(n, stage) or not is_plausible(n, stage)]:
         dropped.update({n: "its size is impossible" for n in names if not is_plausible(n, stage)})
         stage = refit(_without(stage, names), stage)
     return stage
 
 
-def _without_needless(
-    before: ExtendedFit, stage: ExtendedFit, runner: CallRunner, dropped: dict[str, str]
-) -> ExtendedFit:
-    """Return a fit without an effect that gains little beside the others; the same if there is none."""
-    names = added(before, stage)
-    machines = [_without(stage, [n]) for n in names]
-    worst: tuple[float, str, ExtendedFit] | None = None
-    for name, found in zip(names, refit_all(machines, stage, runner), strict=True):
-        if found is None:
-            continue
-        excess = found.deviance - stage.deviance - MIN_LIKELIHOOD_RATIO * stage.dispersion
-        if excess < 0 and (worst is None or excess < worst[0]):
-            worst = excess, name, found
-    if worst is None:
-        return stage
-    dropped[worst[1]] = "the other effects replace it"
-    return worst[2]
+def _fits_without(before: ExtendedFit, stage: ExtendedFit, runner: CallRunner) -> dict[str, ExtendedFit | None]:
+    """Return the fit without each effect but with all others; None where exact dynamics do not follow the logs."""
+    names = added(before, stage) if stage.exact else []
+    found = refit_all([_without(stage, [n]) for n in names], stage, runner)
+    return {name: None if x is None else slim(x) for name, x in zip(names, found, strict=True)}
+
+
+def _needless(stage: ExtendedFit, without: Mapping[str, ExtendedFit | None]) -> str | None:
+    """Return the effect that gains least beside the others, if that is too little; None if there is none."""
+    losses = {n: x.deviance - stage.deviance for n, x in without.items() if x is not None}
+    name = min(losses, key=lambda n: losses[n], default=None)
+    return name if name is not None and losses[name] < MIN_LIKELIHOOD_RATIO * stage.dispersion else None
+
+
+def slim(stage: ExtendedFit) -> ExtendedFit:
+    """Return a fit without its linearised logs, which take most of the memory; its deviance is kept."""
+    slimmed = replace(stage, fit=replace(stage.fit, linear=()))
+    slimmed.__dict__["deviance"] = stage.deviance
+    return slimmed
+
+
+@dataclass(frozen=True)
+class _Rival:
+    """An effect in the place of another: its fit, entry of the machine file, and information (lower is better)."""
+
+    stage: ExtendedFit
+    entry: EffectEntry
+    information: float
 
 
 def _judged(
-    before: ExtendedFit, stage: ExtendedFit, runner: CallRunner, n_candidates: int, deadline: Deadline
+    before: ExtendedFit,
+    stage: ExtendedFit,
+    without: Mapping[str, ExtendedFit | None],
+    runner: CallRunner,
+    deadline: Deadline,
 ) -> tuple[ExtendedFit, tuple[Choice, ...]]:
     """Exchange each effect for a rival that explains the logs better, and return those that explain them as well."""
     names = added(before, stage)
-    if not names:
-        return stage, ()
-    if not stage.exact or deadline.is_over():
+    if not stage.exact or deadline.is_over() or not names:
         return stage, tuple(Choice(n, stage.wald(n), None) for n in names)
-    form = stage.form([*candidates_of(stage), *(_own_candidate(stage, n) for n in names)], runner)
-    machines, owners = list[Machine](), list[tuple[str, EffectEntry | None]]()
-    for name in names:
-        machines.append(_without(stage, [name]))
-        owners.append((name, None))
-        for entry in _likely_rivals(form, stage, name):
-            machines.append(effects.with_effects(_without(stage, [name]), entry))
-            owners.append((name, entry))
-    results = list(refit_all(machines, stage, runner))
+    form = stage.form([*candidates_of(stage), *(Candidate(stage.fitted(n), (0,)) for n in names)], runner)
+    tried = [(name, entry) for name in names for entry in _likely_rivals(form, stage, name)]
+    machines = [effects.with_effects(_without(stage, [name]), entry) for name, entry in tried]
+    rivals: dict[str, list[_Rival]] = {name: [] for name in names}
+    for (name, entry), x in zip(tried, refit_all(machines, stage, runner), strict=True):
+        other = f"{entry.name}@{entry.where}"
+        if x is None or _fell_to_zero(other, x) or not is_plausible(other, x) or x.impossible:
+            continue
+        rivals[name].append(_Rival(slim(x), fitted_entry(x, other), information(x, other)))
+        if information(x, other) < information(stage, name) - CLEARLY_BETTER:
+            return _judged(before, x, _fits_without(before, x, runner), runner, deadline)
     choices = []
     for name in names:
-        own = [(entry, x) for (n, entry), x in zip(owners, results, strict=True) if n == name]
-        without = own[0][1]
-        ratio = without.deviance - stage.deviance if without is not None else stage.wald(name)
-        rivals = [(x, _named(x, entry)) for entry, x in own[1:] if entry is not None and x is not None]
-        rivals = [(x, n) for x, n in rivals if not _fell_to_zero(n, x) and is_plausible(n, x) and not x.impossible]
-        better = [x for x, n in rivals if information(x, n) < information(stage, name) - CLEARLY_BETTER]
-        if better:
-            return _judged(before, min(better, key=lambda x: x.deviance), runner, n_candidates, deadline)
+        fit = without.get(name)
+        ratio = stage.wald(name) if fit is None else fit.deviance - stage.deviance
         margin = 2 * np.log(evidence.CREDIBLE_ODDS) * stage.dispersion + formula_ratio(ratio)
-        tied = [(x, n) for x, n in rivals if information(x, n) - information(stage, name) < margin]
-        choices.append(Choice(name, ratio, without, tuple(fitted_entry(x, n) for x, n in tied)))
+        tied = [x.entry for x in rivals[name] if x.information - information(stage, name) < margin]
+        choices.append(Choice(name, ratio, fit, tuple(tied)))
     return stage, tuple(choices)
 
 
@@ -331,15 +345,6 @@ def formula_ratio(ratio: float) -> float:
 def information(stage: ExtendedFit, name: str) -> float:
     """Return the deviance with a price for each parameter of an effect: the information of G. Schwarz (1978)."""
     return stage.deviance + float(np.log(stage.data.n_readings)) * degrees_of_freedom(name, stage)
-
-
-def _named(stage: ExtendedFit, entry: EffectEntry) -> str:
-    return next(e.name for e in stage.model.effects if e.effect.name == entry.name and e.where == entry.where)
-
-
-def _own_candidate(stage: ExtendedFit, name: str) -> Candidate:
-    placed = stage.fitted(name)
-    return Candidate(placed, (0,))
 
 
 def _likely_rivals(form: evidence.Form, stage: ExtendedFit, name: str) -> list[EffectEntry]:
@@ -419,6 +424,12 @@ def _sticks(placed: PlacedEffect, angle: float, stage: ExtendedFit) -> bool:
     friction = next(b.friction for b in stage.machine.body if b.index == placed.bodies[0])
     assert friction is not None
     return angle < float(friction.smoothing) / float(stage.machine.sampling_hz)
+
+
+def _is_idle(name: str, stage: ExtendedFit) -> bool:
+    """Tell if a fit led an effect to zero, or next to it."""
+    idle = stage.wald(name) < MIN_LIKELIHOOD_RATIO * stage.dispersion and not stage.placed(name).effect.inverse
+    return _fell_to_zero(name, stage) or (stage.exact and idle)
 
 
 def _fell_to_zero(name: str, stage: ExtendedFit) -> bool:

@@ -67,7 +67,7 @@ def fit_unknown_forces(
     size, inflation, logs, pull = None, np.ones(n_u), tuple(measurements), None
     fit: Fit | None = None
     for settings in rounds:
-        unknown = catalogue(space, list(zip(logs, trajectories, strict=True)), X, white, named)
+        unknown = catalogue(space, list(zip(logs, trajectories, strict=True)), X, white, True if named else None)
         if size is None:
             trajectories = _without_coefficients(trajectories, unknown)
         else:
@@ -78,7 +78,8 @@ def fit_unknown_forces(
         fit = latest if fit is None or not lost else fit
         if lost:
             break
-        pull = log_determinant(space, logs, starts, fit)
+        if settings is not rounds[-1]:
+            pull = log_determinant(space, logs, starts, fit)
         X, trajectories, found = fit.X, fit.trajectories, find_sizes(fit)[0].size
         size = np.maximum(found, SLOWEST_SHRINKING * unknown.size)
         ratio = white_noise_ratios(fit)
@@ -109,7 +110,7 @@ def clustered_inflation(fit: Fit, rate: float) -> np.ndarray:
     covariance, n = inverse(fit.information), len(fit.X)
     meat = np.zeros_like(covariance)
     for log, own in zip(fit.linear, fit.indices, strict=True):
-        E = whiten(log).E[:, :, :-1]
+        E = whiten(log).E
         score = np.einsum("kmc,km->kc", E[:, :, 1:], E[:, :, 0]).astype(float)
         starts = np.arange(0, len(score), int(CLUSTER_S * rate))
         stretches = np.zeros((len(starts), len(covariance)))
