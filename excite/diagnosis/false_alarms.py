@@ -10,8 +10,8 @@ from excite import interrupt
 from excite.diagnosis import selection
 from excite.diagnosis.clean_simulation import can_be_simulated, simulate_clean
 from excite.diagnosis.deadline import Deadline
-from excite.diagnosis.diagnosis import Diagnosis, diagnose
-from excite.diagnosis.findings import assess
+from excite.diagnosis.diagnosis import Diagnosis
+from excite.diagnosis.findings import explain
 from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.selection import ProgressCallback
 from excite.errors import NoEstimateError, NotIdentifiableError, SimulationError
@@ -91,7 +91,7 @@ def count_false_alarms(
             report(k / runs, f"diagnosing clean log {k + 1} of {runs}")
             try:
                 logs, _ = simulate_clean(d.after, FIRST_SEED + k)
-                found = assess(diagnose(model, logs, machine.filter, runner=runner), runner=runner).diagnosis
+                found = explain(model, logs, machine.filter, runner=runner).diagnosis
             except (NoEstimateError, SimulationError):
                 found = None
             if asked.stop:

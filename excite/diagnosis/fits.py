@@ -41,6 +41,7 @@ from excite.text import format_number
 # Cost: sum of squared innovations over their variances. A right model's cost is about the number of readings.
 TRACKING_COST_RATIO = 2.5  # cost over its expected value up to which exact dynamics follow the logs; chosen
 FRICTION_ERROR = 0.1  # share of friction near rest by which an effect's formula may err there; chosen
+CHANCE_STDS = 4.0  # standard deviations of a sum of squares that are no chance
 COST_TOLERANCE = 0.02  # share of its expected value by which a right model's cost may be larger; chosen
 CLOSE_FIT_COST_RATIO = 1.3  # cost over its expectation from noise up to which a fit is close; chosen
 IMPOSSIBLE_SIGN_STDS = 3.0  # standard deviations beyond zero from which a parameter's sign is impossible; chosen
@@ -124,7 +125,8 @@ class ExtendedFit:
     @property
     def excess_cost(self) -> float:
         """Cost beyond what noise may cause."""
-        return max(0.0, self.fit.cost - (1 + COST_TOLERANCE) * self.expected_cost)
+        chance = CHANCE_STDS * float(np.sqrt(2 * self.expected_cost))
+        return max(0.0, self.fit.cost - self.expected_cost - max(COST_TOLERANCE * self.expected_cost, chance))
 
     @cached_property
     def deviance(self) -> float:
@@ -176,6 +178,11 @@ class ExtendedFit:
                 "joint smoothing: a fit cannot be linearised: check the log with `excite log check`"
             )
         return without_smoother_levels(found)
+
+    def release(self) -> None:
+        """Drop the logs along which candidates were scored, which take most of the memory."""
+        for name in ("fitted_logs", "lacking", "bare"):
+            self.__dict__.pop(name, None)
 
     def form(self, found: Sequence[score_test.Candidate], runner: CallRunner = run_in_turn) -> evidence.Form:
         """Return the form of parameters, of what else the model may lack, and of candidates about this fit."""

@@ -93,6 +93,7 @@ def search(before: ExtendedFit, runner: CallRunner, report: ProgressCallback, de
         if not found.candidates or deadline.is_over():
             if deadline.is_over():
                 break
+            stage.release()
             report(0.2 + 0.1 * turn, "testing each effect given the others")
             without = _fits_without(before, stage, runner)
             needless = _needless(stage, without)
@@ -104,6 +105,7 @@ def search(before: ExtendedFit, runner: CallRunner, report: ProgressCallback, de
         found = _refined(stage, found, runner)
         report(0.15 + 0.1 * turn, "fitting effects")
         machine = effects.with_effects(stage.machine, *entries(found))
+        stage.release()
         try:
             stage = _without_idle(before, refit(machine, stage), dropped)
         except NotConvergedError:
@@ -314,6 +316,7 @@ def _judged(
     if not stage.exact or deadline.is_over() or not names:
         return stage, tuple(Choice(n, stage.wald(n), None) for n in names)
     form = stage.form([*candidates_of(stage), *(Candidate(stage.fitted(n), (0,)) for n in names)], runner)
+    stage.release()
     tried = [(name, entry) for name in names for entry in _likely_rivals(form, stage, name)]
     machines = [effects.with_effects(_without(stage, [name]), entry) for name, entry in tried]
     rivals: dict[str, list[_Rival]] = {name: [] for name in names}

@@ -242,7 +242,7 @@ class LogProblem:
 
     def quadratic(self) -> Quadratic | None:
         """Linearise every log and integrate out its states; return None if a chain is singular."""
-        X = self.point.X
+        X, self.linear = self.point.X, ()  # both at once take twice the memory
         try:
             linear = tuple(
                 forward.linearise(self.space, e, start.state[0], X, self.process_noise)

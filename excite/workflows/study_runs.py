@@ -119,10 +119,9 @@ def _run_steps(batch: RunBatch, seed: int) -> Row:
 def _diagnose(model: Model, logs: Sequence[Log]) -> Row:
     """Diagnose logs; return the keys of the summary that go into the table of runs."""
     from excite import diagnosis
-    from excite.diagnosis import diagnose
 
     repaired = [examine(model.machine, one).log for one in logs]
-    summary = diagnosis.summarise(diagnosis.assess(diagnose(model, repaired, model.machine.filter)))
+    summary = diagnosis.summarise(diagnosis.explain(model, repaired, model.machine.filter))
     keys = ("effect", "where", "tied_with", "p_value", "amount", "amount_std", "unit", "gain_percent", "gain_ci95")
     return {
         "verdict": summary["verdict"],
