@@ -282,10 +282,19 @@ def _fits_without(before: ExtendedFit, stage: ExtendedFit, runner: CallRunner) -
 
 
 def _needless(stage: ExtendedFit, without: Mapping[str, ExtendedFit | None]) -> str | None:
-    """Return the effect that gains least beside the others, if that is too little; None if there is none."""
-    losses = {n: x.deviance - stage.deviance for n, x in without.items() if x is not None}
-    name = min(losses, key=lambda n: losses[n], default=None)
-    return name if name is not None and losses[name] < MIN_LIKELIHOOD_RATIO * stage.dispersion else None
+    """Return an effect that gains too little beside the others for a place, the least first; None if there is none.
+
+    What effects at the same place leave by errors of their formulas is no gain of another.
+    """
+    ratios = {n: stage.wald(n) if x is None else x.deviance - stage.deviance for n, x in without.items()}
+    for name in sorted(ratios, key=lambda n: ratios[n]):
+        place = name.partition("@")[2]
+        formulas = sum(formula_ratio(r) for n, r in ratios.items() if n != name and n.partition("@")[2] == place)
+        if without[name] is not None and ratios[name] < max(
+            MIN_LIKELIHOOD_RATIO * stage.dispersion, min(formulas, MAX_FORMULA_RATIO)
+        ):
+            return name
+    return None
 
 
 def slim(stage: ExtendedFit) -> ExtendedFit:
