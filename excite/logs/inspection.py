@@ -8,11 +8,12 @@ import numpy as np
 import pandas as pd
 
 from excite.logs import log
-from excite.logs.checks import Record, findings, record_of
+from excite.logs.checks import findings
 from excite.logs.filtered import too_slow
 from excite.logs.log import Log
 from excite.logs.plausibility import doubts
 from excite.logs.preparation import as_log, at_rate_of, on_one_clock, place_rows
+from excite.logs.record import Record, record_of
 from excite.logs.refusal import caught, lookalike, stray_rows, unit_doubts, wrong_time_unit
 from excite.logs.repair import NEEDED, mended
 from excite.logs.resampling import BRIDGED_STEPS
