@@ -20,6 +20,7 @@ from excite.trajectories import composite_objective, interior_point, ipopt, obje
 from excite.trajectories.collocation import Transcription, solve_states, transcribe
 from excite.trajectories.composite_objective import COND_MAX, SIGMA_MAX, CompositeObjective
 from excite.trajectories.excitation import Manoeuvre, knot_times, multisine, scale_torques
+from excite.trajectories.lane import simulate_on_lane
 from excite.trajectories.limits import (
     REST_POSITION,
     REST_SPEED,
@@ -34,7 +35,6 @@ from excite.trajectories.limits import (
     machine_limits,
     rest_tolerances,
     resting_coordinates,
-    simulate_on_lane,
     travel_directions,
 )
 
