@@ -50,8 +50,11 @@ def linear_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
         if body.friction is not None:
             joints[f"u{k}0"] = (float(body.friction.u0), "N m" if turn else "N")
     every = chassis | joints
-    if not machine.in_ratios:
-        return every
+    return _in_ratios(machine, every) if machine.in_ratios else every
+
+
+def _in_ratios(machine: Machine, every: dict[str, tuple[float, str]]) -> dict[str, tuple[float, str]]:
+    """Return parameters in the units that they have divided by an unknown torque constant."""
     turns = machine.actuated[0].joint == "revolute"
     per_constant = PER_TORQUE_CONSTANT if turns else PER_FORCE_CONSTANT
     own = machine.torque_unit or "A"
