@@ -7,98 +7,30 @@ hooks of their declarations. The contribution of a single effect is its signatur
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
 from excite.errors import MachineError
 from excite.model import effects, mechanics
-from excite.model.effects import ContactMotion, PlacedEffect, SampleView, Soil, Values
+from excite.model.effects import ContactMotion, PlacedEffect, Soil
 from excite.model.machine import Body, Machine, Sensor
+from excite.model.sample import (
+    ActiveEffect,
+    SymbolicSample,
+    active_effect,
+    active_effects,
+    common_view,
+    contact_motion,
+    friction_torque,
+    names_from_map,
+    symbolic_sample,
+    with_shared_contacts,
+)
 from excite.text import format_number
 
 SPEED_ROUNDING = 1e-3  # speed below which the size of a speed is rounded off, for its derivative [m/s]; chosen
-
-
-@dataclass(frozen=True)
-class SymbolicSample:
-    """Symbols of one sample, and the motion of every body in it.
-
-    q, nu, a, u, p, wheels: coordinates, velocities, accelerations, torques, standard parameters, measuring wheels.
-    at, rate, accel: coordinates and their rates by name, zero for locked ones. by_name: standard parameters.
-    read: coordinates as the encoders read them: `at` is less by the zeros that are sought.
-    frames: motion of each body; gravity (3,) in the root's axes; heading of the root [rad].
-    sign: sgn of each joint's rate in its dry friction, by index of the body.
-    """
-
-    machine: Machine
-    q: ca.SX
-    nu: ca.SX
-    a: ca.SX
-    u: ca.SX
-    p: ca.SX
-    wheels: ca.SX
-    at: dict[str, ca.SX]
-    read: dict[str, ca.SX]
-    rate: dict[str, ca.SX]
-    accel: dict[str, ca.SX]
-    by_name: dict[str, ca.SX]
-    frames: dict[int, mechanics.Frame]
-    gravity: ca.SX
-    heading: ca.SX
-    sign: dict[int, ca.SX]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the free coordinates."""
-        return self.machine.coordinates
-
-    def row(self, body: Body) -> int:
-        """Return the equation of a body's joint."""
-        return self.names.index(self.machine.coordinate(body))
-
-    @cached_property
-    def by_inertia(self) -> ca.SX:
-        """Jacobian (n_q, 10 n_bodies) of the generalised forces to the inertial parameters of all bodies."""
-        every = {b.index: ca.SX.sym(f"inertia{b.index}", 10) for b in self.machine.body}
-        return ca.jacobian(self.reduced_forces(self.frames, every), ca.vertcat(*every.values()))
-
-    def reduced_forces(
-        self,
-        frames: dict[int, mechanics.Frame],
-        inertia: dict[int, ca.SX],
-        longer: Mapping[int, ca.SX] = mechanics.NONE_LONGER,
-    ) -> ca.SX:
-        """Return the generalised forces (n_q,) of the free coordinates q: S^T f of all joints' f, whose angles are S q.
-
-        inertia: (10,) parameters of each body. longer [m]: see `mechanics.body_motions`.
-        """
-        rows = mechanics.generalised_forces(self.machine, self.at, frames, inertia, longer)
-        for body in self.machine.body:
-            if body.moves_with is not None:
-                rows[self.machine.coordinate(body)] += self.machine.ratio(body) * rows[body.coordinates[0]]
-        return ca.vertcat(*[rows[c] for c in self.names])
-
-
-@dataclass(frozen=True)
-class ActiveEffect:
-    """An effect in one sample: the view that its hooks get, and values of magnitude and shapes."""
-
-    placed: PlacedEffect
-    view: SampleView
-    values: Values
-
-    def reading_error(self, exact: ca.SX, sensor: Sensor) -> ca.SX:
-        """Return the error of a sensor's reading, zero if the effect does not sit in it."""
-        hook, own = self.placed.effect.reading, self.placed.sensors
-        if hook is None or sensor.name not in own:
-            return ca.SX(0)
-        radius = 1.0 if sensor.radius is None else float(sensor.radius)
-        right = len(own) > 1 and float(sensor.lateral or 0) < 0
-        view = replace(self.view, wheel_radius=radius, outwards=-1.0 if right else 1.0)
-        return hook(view, exact, sensor.body, self.values)
 
 
 @dataclass(frozen=True)
@@ -136,62 +68,6 @@ class SignatureFunctions:
     n_map_inputs: int
 
 
-def symbolic_sample(
-    machine: Machine, standard: tuple[str, ...], sign: Mapping[int, ca.SX] | None = None
-) -> SymbolicSample:
-    """Make the symbols of one sample; standard: names of the standard parameters.
-
-    sign: sgn of joints' rates by index of the body; smoothed over the rate of the machine file where it is not given.
-    """
-    names = machine.coordinates
-    n = len(names)
-    q, nu, a = ca.SX.sym("q", n), ca.SX.sym("nu", n), ca.SX.sym("a", n)
-    p = ca.SX.sym("p", len(standard))
-    full = {c: ca.SX(0) for b in machine.body for c in b.coordinates}
-    by_name = dict(zip(standard, ca.vertsplit(p), strict=True))
-    read = full | dict(zip(names, ca.vertsplit(q), strict=True))
-    at = dict(read)
-    for name, sensor in machine.sought_zeros.items():
-        at[machine.coordinate(machine.find(sensor.body))] -= by_name.get(name, 0)
-    rate = full | dict(zip(names, ca.vertsplit(nu), strict=True))
-    accel = full | dict(zip(names, ca.vertsplit(a), strict=True))
-    for moving in (at, read, rate, accel):
-        for b in machine.body:
-            if b.moves_with is not None:
-                moving[b.coordinates[0]] = machine.ratio(b) * moving[machine.coordinate(b)]
-                if moving is at or moving is read:
-                    moving[b.coordinates[0]] += machine.offset(b)
-    heading = at[machine.body[0].coordinates[2]] if machine.planar else ca.SX(0)
-    gravity = mechanics.rot_z(-heading) @ ca.DM(machine.gravity)
-    smoothed = {
-        b.index: ca.tanh(rate[b.coordinates[0]] / float(b.friction.smoothing))
-        for b in machine.body
-        if b.friction is not None
-    }
-    smoothed |= dict(sign or {})
-    for b in machine.body:  # joints that move together turn and stick together
-        if b.moves_with is not None and b.friction is not None:
-            smoothed[b.index] = np.sign(machine.ratio(b)) * smoothed[b.moves_with.joint]
-    return SymbolicSample(
-        machine,
-        q,
-        nu,
-        a,
-        ca.SX.sym("u", len(machine.actuated)),
-        p,
-        ca.SX.sym("wheels", sum(s.kind == "wheel" for s in machine.sensor)),
-        at,
-        read,
-        rate,
-        accel,
-        by_name,
-        mechanics.body_motions(machine, at, rate, accel, gravity),
-        gravity,
-        heading,
-        smoothed,
-    )
-
-
 def signed_balance(machine: Machine, standard: tuple[str, ...], placed: Sequence[PlacedEffect]) -> ca.Function:
     """Build the balance (q, nu, a, p, u, z, sign) with sgn of the joints' rates as an argument.
 
@@ -200,7 +76,7 @@ def signed_balance(machine: Machine, standard: tuple[str, ...], placed: Sequence
     sign = ca.SX.sym("sign", len(machine.rubbing))
     given = dict(zip([b.index for b in machine.rubbing], ca.vertsplit(sign), strict=True))
     s = symbolic_sample(machine, standard, given)
-    _, _, z, acting = _active_effects(s, placed)
+    _, _, z, acting = active_effects(s, placed)
     beside = [s.u, z] if placed else []
     return ca.Function("signed_balance", [s.q, s.nu, s.a, s.p, *beside, sign], [_balance(s, acting)[0]])
 
@@ -216,7 +92,7 @@ def force_directions(machine: Machine, standard: tuple[str, ...]) -> tuple[tuple
     found: dict[tuple[int, str], ca.SX] = {}
     for body in machine.contacts:
         assert body.contact is not None
-        lever, radius = _contact_motion(s, body)[1], float(body.contact.radius)
+        lever, radius = contact_motion(s, body)[1], float(body.contact.radius)
         units = {
             "lengthwise": (1, 0, -radius, 0),
             "lateral": (0, 1, 0, 0),
@@ -237,7 +113,7 @@ def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[Plac
     for body in machine.contacts:
         _check_axis(machine, body)
     s = symbolic_sample(machine, standard)
-    memory, map_inputs, z, acting = _active_effects(s, placed)
+    memory, map_inputs, z, acting = active_effects(s, placed)
     balance, slips = _balance(s, acting)
     time = ca.SX.sym("t")
     gain, offset, delay = _channels(s, acting, time)
@@ -294,12 +170,12 @@ def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[Pla
     exact = ca.SX.sym("exact", sum(x.kind != "torque" for x in machine.sensors("full")))
     force, reading, rates = [], [], list[ca.SX]()
     states: list[ca.SX] = []
-    view = _common_view(s, time)
-    map_inputs = [ca.SX.sym(name) for name in _map_names(machine, placed)]
-    motions = {b.index: _contact_motion(s, b) for b in machine.contacts}
+    view = common_view(s, time)
+    map_inputs = [ca.SX.sym(name) for name in names_from_map(machine, placed)]
+    motions = {b.index: contact_motion(s, b) for b in machine.contacts}
     for e in placed:
         z = {m: ca.SX.sym(m) for m in e.memory}
-        (own,) = _with_shared_contacts([_active_effect(s, view, e, z, map_inputs)])
+        (own,) = with_shared_contacts([active_effect(s, view, e, z, map_inputs)])
         added = _effect_force(s, own, inertia)
         if e.effect.extra_radius is not None or e.effect.soil is not None:
             for k in e.bodies:
@@ -327,89 +203,9 @@ def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[Pla
     )
 
 
-def _map_names(machine: Machine, placed: Sequence[PlacedEffect]) -> tuple[str, ...]:
-    """Name the inputs from a map of the ground, () if no effect uses it."""
-    if not any(e.uses_map for e in placed):
-        return ()
-    return tuple(f"over{b.index}.{n + 1}" for b in machine.contacts for n in range(effects.MAX_PASSES))
-
-
-def _active_effects(
-    s: SymbolicSample, placed: Sequence[PlacedEffect]
-) -> tuple[tuple[str, ...], tuple[str, ...], ca.SX, list[ActiveEffect]]:
-    """Return names of memory states (those from the map last), names from the map, symbols z, and active effects."""
-    map_names = _map_names(s.machine, placed)
-    memory = ["time"] if any(e.effect.timed for e in placed) else []
-    memory += [f"{e.name}.{m}" for e in placed for m in e.memory]
-    memory += map_names
-    z = ca.SX.sym("z", len(memory))
-    known = dict(zip(memory, ca.vertsplit(z), strict=True))
-    view = _common_view(s, known.get("time", ca.SX(0)))
-    map_inputs = [known[name] for name in map_names]
-    acting = [_active_effect(s, view, e, {m: known[f"{e.name}.{m}"] for m in e.memory}, map_inputs) for e in placed]
-    return tuple(memory), map_names, z, _with_shared_contacts(acting)
-
-
-def _with_shared_contacts(acting: list[ActiveEffect]) -> list[ActiveEffect]:
-    """Show all effects the contacts as changed by those with an `extra_radius`."""
-    extra_radius: dict[int, ca.SX] = {}
-    for e in acting:
-        if e.placed.effect.extra_radius is not None:
-            for k in e.placed.bodies:
-                extra_radius[k] = extra_radius.get(k, ca.SX(0)) + e.placed.effect.extra_radius(e.view, k, e.values)
-    if not extra_radius:
-        return acting
-    contacts = {k: replace(r, extra_radius=extra_radius.get(k, 0.0)) for k, r in acting[0].view.contacts.items()}
-    return [replace(e, view=replace(e.view, contacts=contacts)) for e in acting]
-
-
-def _common_view(s: SymbolicSample, time: ca.SX) -> SampleView:
-    """Return the view of a sample that effects have in common."""
-    turning = [b for b in s.machine.body if b.coordinates and b.joint != "planar"]
-    rubbing = [b for b in turning if b.friction is not None]
-    return SampleView(
-        {b.index: s.at[b.coordinates[0]] for b in turning},
-        {b.index: s.rate[b.coordinates[0]] for b in turning},
-        {
-            b.index: torque * (1.0 if b.driven_with is None else float(b.driven_with.ratio))
-            for driven, torque in zip(s.machine.actuated, ca.vertsplit(s.u), strict=True)
-            for b in s.machine.drives(driven)
-        },
-        {b.index: _friction_torque(s, b) for b in rubbing},
-        {b.index: s.by_name[f"Fs{b.index}"] for b in rubbing},
-        {b.index: float(b.friction.smoothing) for b in rubbing if b.friction is not None},
-        s.sign,
-        {b.index: effects.large_torque(s.machine, b) for d in s.machine.actuated for b in s.machine.drives(d)},
-        {b.index: _contact_motion(s, b)[0] for b in s.machine.contacts},
-        {b.index: s.frames[b.index].velocity[0] for b in s.machine.body},
-        {b.index: s.frames[b.index].omega[2] for b in s.machine.body},
-        time,
-    )
-
-
-def _active_effect(
-    s: SymbolicSample, view: SampleView, e: PlacedEffect, z: dict[str, ca.SX], map_inputs: Sequence[ca.SX]
-) -> ActiveEffect:
-    """Return an effect with its memory states z and, if it uses the map, the inputs from it."""
-    values = {key: ca.SX(x) for key, x in e.values.items()}
-    values |= {key: s.by_name[name] for name, (key, _) in e.parameters.items() if name in s.by_name}
-    passes = {b.index: ca.SX.zeros(effects.MAX_PASSES) for b in s.machine.contacts}
-    if e.uses_map:
-        n = effects.MAX_PASSES
-        passes = {k: ca.vertcat(*map_inputs[n * i : n * (i + 1)]) for i, k in enumerate(passes)}
-    own = replace(view, z=dict.fromkeys(e.memories, ca.SX(0)) | z, passes=passes)
-    return ActiveEffect(e, own, values)
-
-
 def _memory_rates(e: ActiveEffect) -> list[ca.SX]:
     """Return the rates of an effect's memory states."""
     return [own.rate(e.view, k, e.values) for k, own in e.placed.memory.values()]
-
-
-def _friction_torque(s: SymbolicSample, body: Body) -> ca.SX:
-    """Return Fv w + Fs sgn w [N m] of a joint."""
-    w, k = s.rate[body.coordinates[0]], body.index
-    return s.by_name[f"Fv{k}"] * w + s.by_name[f"Fs{k}"] * s.sign[k]
 
 
 def _rotor_acceleration(s: SymbolicSample, body: Body) -> ca.SX:
@@ -427,7 +223,7 @@ def _joint_torque(s: SymbolicSample, body: Body) -> ca.SX:
     if f"Kb{k}" in s.by_name:
         torque += s.by_name[f"Kb{k}"] * s.rate[body.coordinates[0]]
     if body.friction is not None:
-        torque += _friction_torque(s, body)
+        torque += friction_torque(s, body)
     return torque
 
 
@@ -461,7 +257,7 @@ def _balance(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX, 
         force -= _effect_force(s, e, inertia)
     slips: dict[str, ca.SX] = {}
     for body in machine.contacts:
-        plain, lever = _contact_motion(s, body)
+        plain, lever = contact_motion(s, body)
         motion = acting[0].view.contacts[body.index] if acting else plain
         slips |= {f"gx{body.index}": plain.slip.gx, f"gy{body.index}": plain.slip.gy}
         force -= _contact_force(body, _changed_soil(s, acting, body, motion), lever, motion)
@@ -479,7 +275,7 @@ def _effect_force(s: SymbolicSample, e: ActiveEffect, inertia: Mapping[int, ca.S
         if effect.torque is not None:
             force[s.row(body)] += machine.ratio(body) * effect.torque(e.view, k, e.values)
         if effect.push is not None:
-            lever = _contact_motion(s, body)[1]
+            lever = contact_motion(s, body)[1]
             force += lever[:2, :].T @ ca.vertcat(*effect.push(e.view, k, e.values))
     if effect.gravity is not None:
         pull = mechanics.rot_z(-s.heading) @ (_level_axes(machine) @ ca.vertcat(*effect.gravity(e.view, e.values)))
@@ -527,20 +323,6 @@ def _recoil_force(s: SymbolicSample, e: ActiveEffect, change: Mapping[str, ca.SX
     MX, ZZ = (ca.jacobian(change[name], e.view.time) for name in ("MX", "ZZ"))
     yaw = frame.omega[2]
     return lever.T @ ca.vertcat(-ca.jacobian(MX, e.view.time), -2 * yaw * MX, -yaw * ZZ)
-
-
-def _contact_motion(s: SymbolicSample, body: Body) -> tuple[ContactMotion, ca.SX]:
-    """Return a contact's motion, and the Jacobian (4, n_q) of (Vx, Vy, spin, yaw) to the velocities."""
-    assert body.contact is not None
-    assert not isinstance(body.antecedent, str)
-    carrier, own = s.frames[body.antecedent], s.frames[body.index]
-    R, _ = mechanics.joint_transform(body, {c: ca.SX(0) for c in body.coordinates})
-    turn = carrier.rotation.T @ own.rotation
-    centre = turn @ own.velocity
-    spin = (R[:, 2].T @ turn) @ own.omega
-    yaw = carrier.omega[2]
-    lever = ca.jacobian(ca.vertcat(centre[0], centre[1], spin, yaw), s.nu)
-    return ContactMotion(body.contact, centre[0], centre[1], spin, yaw), lever
 
 
 def _plain_soil(s: SymbolicSample, body: Body, motion: ContactMotion) -> Soil:
@@ -644,7 +426,7 @@ def edge_slips(s: SymbolicSample) -> tuple[tuple[tuple[int, str], ...], ca.Funct
     """Return places (body, edge) of the contacts, and the function (q, nu) -> slips g_x, g_y there (2, n_places)."""
     found: dict[tuple[int, str], ca.SX] = {}
     for body in s.machine.contacts:
-        motion = _contact_motion(s, body)[0]
+        motion = contact_motion(s, body)[0]
         across = mechanics.slips_across(motion.contact, motion.slip, motion.yaw)
         found |= {(body.index, place): g for place, g in across.items()}
     slips = ca.densify(ca.horzcat(*found.values(), ca.SX(2, 0)))

@@ -8,7 +8,6 @@ physics is written once. Effects of the machine file are part of the prediction;
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -17,7 +16,6 @@ import casadi as ca
 import numpy as np
 
 from excite.errors import MachineError
-from excite.model import mechanics
 from excite.model.base_parameters import BaseParameters, append_parameters, base_parameters
 from excite.model.effects import GroundMap, PlacedEffect, Site, place_effect
 from excite.model.equations import (
@@ -30,100 +28,15 @@ from excite.model.equations import (
     signed_balance,
 )
 from excite.model.known_values import KnownValues, known_values, nothing_known
-from excite.model.machine import PER_FORCE_CONSTANT, PER_TORQUE_CONSTANT, Body, Machine, Quantity
+from excite.model.machine import Body, Machine, Quantity
+from excite.model.parameters import encoder_zeros, linear_parameters, standard_parameters
 from excite.text import format_number
 
 SCALE_SAMPLES = 400  # random samples from which the default scale is taken; chosen
 USUAL_SPEED = 1.0  # rad/s or m/s, of a joint without a limit; chosen
 USUAL_FREQUENCY = 3.0  # rad/s, acceleration over speed: half a turn a second; chosen
-ZERO_SIZES = (0.02, 0.002)  # rad, m; of an encoder's zero that is sought; chosen
 HIDDEN_SHARE = 1e-6  # of a column beyond the others, over its size, from which motions show it; chosen
 MIN_SHOWN_SHARE = 1e-3  # share of the torques (rms) from which a value shows; chosen
-
-
-def standard_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
-    """Return nominal value [SI] and unit of every standard parameter: bodies, joints, encoder zeros that are sought.
-
-    The order decides which column of a dependent set stands for it, and it is the order of every table.
-    """
-    return _linear_parameters(machine) | {n: (value, unit) for n, (value, unit, _) in encoder_zeros(machine).items()}
-
-
-def _linear_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
-    """Return nominal value [SI] and unit of the standard parameters that the prediction is linear in."""
-    chassis: dict[str, tuple[float, str]] = {}
-    joints: dict[str, tuple[float, str]] = {}
-    for body in machine.body:
-        k = body.index
-        inertia = {n: (v, _inertial_unit(n)) for n, v in mechanics.standard_inertia(body).items()}
-        if body.inertia is not None and body.inertia.axisymmetric:
-            joints |= inertia
-        else:
-            chassis |= inertia
-        turn = body.joint == "revolute"
-        if body.drive is not None:
-            joints[f"Ia{k}"] = (float(body.drive.rotor_inertia), "kg m2" if turn else "kg")
-        if body.friction is not None:
-            joints[f"Fv{k}"] = (float(body.friction.Fv), "N m s" if turn else "N s/m")
-            joints[f"Fs{k}"] = (float(body.friction.Fs), "N m" if turn else "N")
-        back_emf = sum(s.back_emf_damping for s in machine.sensor if s.kind == "torque" and s.body == k)
-        if back_emf:
-            joints[f"Kb{k}"] = (back_emf, "N m s" if turn else "N s/m")
-        if body.spring is not None:
-            stiffness = float(body.spring.stiffness)
-            joints[f"Ks{k}"] = (stiffness, "N m/rad" if turn else "N/m")
-            joints[f"Ts{k}"] = (stiffness * float(body.spring.rest), "N m" if turn else "N")
-            if body.spring.damping is not None:
-                joints[f"Ds{k}"] = (float(body.spring.damping), "N m s" if turn else "N s/m")
-        if body.contact is not None:
-            joints[f"Kx{k}"] = (float(body.contact.Kx), "N")
-            joints[f"Ky{k}"] = (float(body.contact.Ky), "N")
-        if body.friction is not None:
-            joints[f"u{k}0"] = (float(body.friction.u0), "N m" if turn else "N")
-    every = chassis | joints
-    if not machine.in_ratios:
-        return every
-    turns = machine.actuated[0].joint == "revolute"
-    per_constant = PER_TORQUE_CONSTANT if turns else PER_FORCE_CONSTANT
-    own = machine.torque_unit or "A"
-    found = {}
-    for name, (value, unit) in every.items():
-        per_ampere = per_constant.get(unit, f"{unit} A/({'N m' if turns else 'N'})")
-        found[name] = value, re.sub(r"\bA\b", own, per_ampere)
-    return found
-
-
-def encoder_zeros(machine: Machine) -> dict[str, tuple[float, str, float]]:
-    """Return nominal value, unit and size of every encoder zero that is sought, beyond what its file subtracts.
-
-    The readings are the coordinates; forces act at coordinate - zero.
-    """
-    straight = {n: machine.find(s.body).joint == "prismatic" for n, s in machine.sought_zeros.items()}
-    return {n: (0.0, "m" if slides else "rad", ZERO_SIZES[slides]) for n, slides in straight.items()}
-
-
-def required_signs(machine: Machine) -> dict[str, float]:
-    """Return the physically required sign by standard parameter: contact stiffness -1, joint parameters +1."""
-    found: dict[str, float] = {}
-    for body in machine.body:
-        if body.friction is not None:
-            found |= dict.fromkeys((f"Fv{body.index}", f"Fs{body.index}"), 1.0)
-        if body.drive is not None:
-            found[f"Ia{body.index}"] = 1.0
-        if any(s.back_emf_damping for s in machine.sensor if s.body == body.index):
-            found[f"Kb{body.index}"] = 1.0
-        if body.spring is not None:
-            found[f"Ks{body.index}"] = 1.0
-            if body.spring.damping is not None:
-                found[f"Ds{body.index}"] = 1.0
-        if body.contact is not None:
-            found |= dict.fromkeys((f"Kx{body.index}", f"Ky{body.index}"), -1.0)
-    return found
-
-
-def _inertial_unit(name: str) -> str:
-    letters = name.rstrip("0123456789")
-    return {1: "kg", 2: "kg m" if letters[0] == "M" else "kg m2"}[len(letters)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -456,7 +369,7 @@ def build(machine: Machine, fit_sensor_effects: bool = True, fit_shapes: bool = 
     fit_shapes: shapes of effects are parameters, too.
     Raises MachineError if no parameter is left, or for an effect that the machine can't have.
     """
-    table = _linear_parameters(machine)
+    table = linear_parameters(machine)
     _check_names(machine, tuple(table))
     placed = tuple(place_effect(machine, entry) for entry in machine.effect)
     twice = sorted({e.name for e in placed if [f.name for f in placed].count(e.name) > 1})

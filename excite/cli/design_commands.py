@@ -41,6 +41,40 @@ from excite.text import count
 commands = typer.Typer()
 
 
+BetweenOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--between",
+        help="given twice or more: effects NAME[@WHERE]=MAGNITUDE that the drive must separate, such as"
+        " ground_slope=0.01; `excite docs` lists effects and units",
+    ),
+]
+OfOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--of", help="profile (.csv), or a design's folder, of the drive that --objective prediction is about"
+    ),
+]
+TargetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--target",
+        help="design the fewest and shortest drives after which the worst parameter has this standard deviation, in"
+        " per cent; PARAMETER=PERCENT for a single one (repeatable); with another --objective, a target of its"
+        " value",
+    ),
+]
+DrivesOption = Annotated[int, typer.Option("--drives", min=1, help="for --target: most drives, designed together")]
+WithinOption = Annotated[
+    float | None,
+    typer.Option(
+        "--within", help="for --target: longest time of driving, in seconds; no drive is longer than --duration"
+    ),
+]
+DriverOption = Annotated[bool, typer.Option("--driver", help="design for a person at the levers, in phases")]
+PhaseMinOption = Annotated[float, typer.Option("--phase-min", help="shortest phase for --driver, in seconds")]
+
+
 @commands.command(cls=DrawingCommand)
 def design(
     machine: MachineArgument,
@@ -51,38 +85,13 @@ def design(
     cond_slack: CondSlackOption = 12.0,
     robust: RobustOption = False,
     after: AfterOption = None,
-    between: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--between",
-            help="given twice or more: effects NAME[@WHERE]=MAGNITUDE that the drive must separate, such as"
-            " ground_slope=0.01; `excite docs` lists effects and units",
-        ),
-    ] = None,
-    of: Annotated[
-        Path | None,
-        typer.Option(
-            "--of", help="profile (.csv), or a design's folder, of the drive that --objective prediction is about"
-        ),
-    ] = None,
-    target: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--target",
-            help="design the fewest and shortest drives after which the worst parameter has this standard deviation, in"
-            " per cent; PARAMETER=PERCENT for a single one (repeatable); with another --objective, a target of its"
-            " value",
-        ),
-    ] = None,
-    drives: Annotated[int, typer.Option("--drives", min=1, help="for --target: most drives, designed together")] = 1,
-    within: Annotated[
-        float | None,
-        typer.Option(
-            "--within", help="for --target: longest time of driving, in seconds; no drive is longer than --duration"
-        ),
-    ] = None,
-    driver: Annotated[bool, typer.Option("--driver", help="design for a person at the levers, in phases")] = False,
-    phase_min: Annotated[float, typer.Option("--phase-min", help="shortest phase for --driver, in seconds")] = 3.0,
+    between: BetweenOption = None,
+    of: OfOption = None,
+    target: TargetOption = None,
+    drives: DrivesOption = 1,
+    within: WithinOption = None,
+    driver: DriverOption = False,
+    phase_min: PhaseMinOption = 3.0,
     starts: StartsOption = 2,
     seed: SeedOption = 0,
     budget: BudgetOption = None,

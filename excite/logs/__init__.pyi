@@ -1,4 +1,3 @@
-from .checks import stretches as stretches
 from .conversion import convert as convert, table_from as table_from
 from .filtered import (
     BLOCK as BLOCK,
@@ -26,6 +25,7 @@ from .log import (
     table_of as table_of,
     white_noise as white_noise,
 )
+from .outliers import stretches as stretches
 from .plausibility import doubts_in_errors as doubts_in_errors
 from .preparation import Prepared as Prepared, prepare as prepare, read_stretches as read_stretches
 from .profile import (

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
 from excite.logs import log
-from excite.logs.checks import Record, findings, record_of
+from excite.logs.checks import findings
 from excite.logs.filtered import too_slow
 from excite.logs.log import Log
 from excite.logs.plausibility import doubts
 from excite.logs.preparation import as_log, at_rate_of, on_one_clock, place_rows
+from excite.logs.record import Finding, Record, record_of
 from excite.logs.refusal import caught, lookalike, stray_rows, unit_doubts, wrong_time_unit
 from excite.logs.repair import NEEDED, mended
 from excite.logs.resampling import BRIDGED_STEPS
@@ -99,14 +101,8 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
     faults += () if strays else unread.values()
     absent, lacking = _absent(table, machine)
     remarks += lacking
-    if record.channels or not found.keys().isdisjoint(table.columns):
-        faults += absent
-    else:
-        own = f": `excite machine new NAME --like {machine.name}` writes a machine file to name them in"
-        faults.append(
-            f"none of the columns of {machine.name} is there; is it a log of another machine, or with columns"
-            f" of its own{own if machine.name in shipped_machines() else '?'}"
-        )
+    known = bool(record.channels) or not found.keys().isdisjoint(table.columns)
+    faults += absent if known else [_no_column(machine)]
     seen = findings(record)
     faults += [f.text for f in seen if f.kind == "fault"]
     units, unheard = unit_doubts(table, machine)
@@ -119,12 +115,8 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
     if clock:
         faults.append(clock)
     elif not strays:
-        accused = {f.sensor for f in seen if f.kind == "fault"}
-        bad = {c for s in machine.sensors("full") for c in s.columns if s.name in accused}
-        used = _as_used(table, record, machine, {*bad, *unread}, faults, remarks)
-        faults += [line for own, _, _ in used if (line := too_slow(float(own.sampling_hz), own.filter))]
-        for with_rate, one, _ in () if faults else used:
-            doubtful += doubts(with_rate, one.values, one.interpolated)
+        used = _as_used(table, record, machine, {*_accused(machine, seen), *unread}, faults, remarks)
+        doubtful += _doubts_of_used(used, faults)
     unknown = [c.name for c in columns if not c.what and c.name not in log.columns_known(machine)]
     if unknown:
         remarks.append(f"not used: {', '.join(unknown)}")
@@ -146,6 +138,27 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         tuple((f.sensor, span) for f in seen for span in f.spans),
         tuple(used),
     )
+
+
+def _no_column(machine: Machine) -> str:
+    """Say that a table has none of a machine's columns."""
+    own = f": `excite machine new NAME --like {machine.name}` writes a machine file to name them in"
+    return (
+        f"none of the columns of {machine.name} is there; is it a log of another machine, or with columns of its"
+        f" own{own if machine.name in shipped_machines() else '?'}"
+    )
+
+
+def _accused(machine: Machine, seen: Sequence[Finding]) -> set[str]:
+    """Return the columns of sensors with a fault."""
+    faulty = {f.sensor for f in seen if f.kind == "fault"}
+    return {c for s in machine.sensors("full") for c in s.columns if s.name in faulty}
+
+
+def _doubts_of_used(used: Sequence[tuple[Machine, Log, float]], faults: list[str]) -> list[str]:
+    """Return what is doubtful about the stretches that are used, unless there are faults; add those that are slow."""
+    faults += [line for own, _, _ in used if (line := too_slow(float(own.sampling_hz), own.filter))]
+    return [] if faults else [x for own, one, _ in used for x in doubts(own, one.values, one.interpolated)]
 
 
 def _absent(table: pd.DataFrame, machine: Machine) -> tuple[list[str], list[str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -122,41 +123,11 @@ def read_drive(source: str | Path | pd.DataFrame, model: Model, any_rate: bool =
     table = source if isinstance(source, pd.DataFrame) else tables.read_table(drive_file(source))
     source = str(table.attrs.get("source", "profile")) if isinstance(source, pd.DataFrame) else str(source)
     needed = ["t_s", *(torque_column(model, n) for n in model.inputs)]
-    missing = [c for c in needed if c not in table.columns]
-    alien = [c for c in table.columns if re.fullmatch(r"u\d+_Nm?", str(c)) and c not in needed]
-    if alien and not missing:
-        raise LogError(f"{source}: column {alien[0]}: {model.machine.name} has no such drive; is it another's profile?")
-    moved = [c for names in motion_columns(model) for c in names if c in table.columns]
-    if missing and moved and not any(c in table.columns for c in needed[1:]):
-        raise LogError(
-            f"{source}: has a motion ({moved[0]}) but no torques: a drive is what the motors deliver over time, add the"
-            f" columns {', '.join(needed[1:])}"
-        )
-    if missing:
-        raise LogError(
-            f"{source}: no column {', '.join(missing)}, {columns_of(table)}; is this a profile of {model.machine.name}?"
-        )
-    t = numbers(table, "t_s", source)
-    if len(t) < 2:
-        raise LogError(f"{source}: only {count(len(t), 'row')}, a profile needs at least 2")
-    rate = float(model.machine.sampling_hz)
-    usual = 1 / float(np.median(np.diff(t))) if (np.diff(t) > 0).all() else rate
-    if usual < SLOWEST_HZ or 0 < (t[-1] - t[0]) * rate < 1:
-        raise LogError(
-            f"{source}: column t_s: {len(t)} rows {format_number(1 / usual, 4)} s apart; a profile lasts more than"
-            f" {1 / rate:g} s, with rows at most {1 / SLOWEST_HZ:g} s apart: is the time in seconds?"
-        )
-    own = usual if any_rate and abs(usual / rate - 1) > OFF_RATE else rate
-    check_time(t, own, "t_s", source)
+    _require_columns(table, model, needed, source)
+    t, rate = numbers(table, "t_s", source), float(model.machine.sampling_hz)
+    own = _own_rate(t, rate, any_rate, source)
     torque = np.column_stack([numbers(table, c, source) for c in needed[1:]])
-    for k, name in enumerate(model.inputs):
-        limit = model.machine.find(int(name[1:])).limit.torque
-        top = float(np.abs(torque[:, k]).max())
-        if limit is not None and top > 10 * float(limit):
-            raise LogError(
-                f"{source}: column {needed[k + 1]}: up to {format_number(top, 3)}, more than ten times the drive's"
-                f" limit {float(limit):g}; is the unit right?"
-            )
+    _require_torques(model, torque, needed[1:], source)
     columns = motion_columns(model)
     given = {c: numbers(table, c, source) for pair in columns for c in pair if c in table.columns}
     if own != rate:
@@ -176,3 +147,48 @@ def read_drive(source: str | Path | pd.DataFrame, model: Model, any_rate: bool =
         return PlannedDrive(torque, start, speed, placed=bool(placed))
     q, nu = (np.column_stack([given[c] for c in names]) for names in zip(*columns, strict=True))
     return PlannedDrive(torque, start, speed, q, nu)
+
+
+def _require_columns(table: pd.DataFrame, model: Model, needed: Sequence[str], source: str) -> None:
+    """Raise LogError for a profile without time or a torque, or with those of another machine."""
+    missing = [c for c in needed if c not in table.columns]
+    alien = [c for c in table.columns if re.fullmatch(r"u\d+_Nm?", str(c)) and c not in needed]
+    if alien and not missing:
+        raise LogError(f"{source}: column {alien[0]}: {model.machine.name} has no such drive; is it another's profile?")
+    moved = [c for names in motion_columns(model) for c in names if c in table.columns]
+    if missing and moved and not any(c in table.columns for c in needed[1:]):
+        raise LogError(
+            f"{source}: has a motion ({moved[0]}) but no torques: a drive is what the motors deliver over time, add the"
+            f" columns {', '.join(needed[1:])}"
+        )
+    if missing:
+        raise LogError(
+            f"{source}: no column {', '.join(missing)}, {columns_of(table)}; is this a profile of {model.machine.name}?"
+        )
+
+
+def _own_rate(t: np.ndarray, rate: float, any_rate: bool, source: str) -> float:
+    """Return the rate [Hz] of a profile's times t (n,) [s]: the machine's, or any. Raises LogError for others."""
+    if len(t) < 2:
+        raise LogError(f"{source}: only {count(len(t), 'row')}, a profile needs at least 2")
+    usual = 1 / float(np.median(np.diff(t))) if (np.diff(t) > 0).all() else rate
+    if usual < SLOWEST_HZ or 0 < (t[-1] - t[0]) * rate < 1:
+        raise LogError(
+            f"{source}: column t_s: {len(t)} rows {format_number(1 / usual, 4)} s apart; a profile lasts more than"
+            f" {1 / rate:g} s, with rows at most {1 / SLOWEST_HZ:g} s apart: is the time in seconds?"
+        )
+    own = usual if any_rate and abs(usual / rate - 1) > OFF_RATE else rate
+    check_time(t, own, "t_s", source)
+    return own
+
+
+def _require_torques(model: Model, torque: np.ndarray, columns: Sequence[str], source: str) -> None:
+    """Raise LogError for torques (N, n_u) far above a drive's limit."""
+    for k, name in enumerate(model.inputs):
+        limit = model.machine.find(int(name[1:])).limit.torque
+        top = float(np.abs(torque[:, k]).max())
+        if limit is not None and top > 10 * float(limit):
+            raise LogError(
+                f"{source}: column {columns[k]}: up to {format_number(top, 3)}, more than ten times the drive's"
+                f" limit {float(limit):g}; is the unit right?"
+            )

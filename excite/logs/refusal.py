@@ -13,10 +13,11 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs import log
-from excite.logs.checks import WRONG_RATE, Finding, findings, record_of, refuse
+from excite.logs.checks import findings, refuse
 from excite.logs.files.common import UNITS_UNKNOWN
 from excite.logs.files.layout import known_unit
 from excite.logs.plausibility import own_file
+from excite.logs.record import WRONG_RATE, Finding, record_of
 from excite.logs.repair import mended
 from excite.logs.tables import COMMENTS
 from excite.logs.times import has_time, seconds

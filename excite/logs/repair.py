@@ -7,20 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from excite.logs.checks import (
-    Channel,
-    Record,
-    dropouts_of,
-    find_dropouts as find_dropouts,
-    find_spikes as find_spikes,
-    findings,
-    record_of_log,
-    refuse,
-    spikes_of,
-    too_many,
-)
+from excite.logs.checks import findings, refuse
 from excite.logs.log import Log
+from excite.logs.outliers import dropouts_of, spikes_of, too_many
 from excite.logs.plausibility import doubts
+from excite.logs.record import Channel, Record, record_of_log
 from excite.model.machine import Machine, Sensor
 from excite.text import count, format_number
 

@@ -22,7 +22,7 @@ import numpy as np
 import scipy
 
 from excite.model import Model
-from excite.model.machine import Body
+from excite.model.machine import Body, Machine, Quantity
 from excite.simulation.integrator import Motion, respond
 
 DRIVER_STREAM = 2  # stream of random numbers, independent of the sensors'
@@ -96,14 +96,10 @@ def follow(
 
     n_q = len(model.coordinates)
     rows = list(model.actuated)
-    limits = [b.limit for b in machine.actuated]
     radius = [float(b.contact.radius) if b.contact is not None else 1.0 for b in machine.actuated]
-    most = [float(x.rim_speed) if x.rim_speed is not None else np.inf for x in limits]
-    swing = [float(x.rate) if x.rate is not None else np.inf for x in limits]
-    fastest = [(most[k] / radius[k] if k in rolling else swing[k]) for k in range(len(rows))]
+    fastest, top, climb = _drive_limits(machine)
+    climb = climb / rate
     gain = drive_gains(model).tolist()
-    top = np.array([float(x.torque) if x.torque is not None else np.inf for x in limits])
-    climb = np.array([float(x.torque_rate) if x.torque_rate is not None else np.inf for x in limits]) / rate
     settled = 1 - np.exp(-2 * np.pi * driver.hydraulics_hz / rate)
     seen: list[list[float]] = []
     watched = [rows[j] for j in joints]
@@ -180,6 +176,19 @@ def _slow_errors(n: int, rate: float, rng: np.random.Generator) -> np.ndarray:
     noise = scipy.signal.lfilter([1 / size], shape, rng.standard_normal(before + n))[before:]
     fade = np.clip(np.minimum(np.arange(n), np.arange(n)[::-1]) / rate / 2, 0, 1)
     return np.asarray(noise * fade)
+
+
+def _drive_limits(machine: Machine) -> tuple[list[float], np.ndarray, np.ndarray]:
+    """Return limits of each drive's rate [rad/s, m/s], torque [N m, N] and torque rate; infinite without one."""
+
+    def of(limit: Quantity | None) -> float:
+        return np.inf if limit is None else float(limit)
+
+    driven = machine.actuated
+    fastest = [
+        of(b.limit.rate) if b.contact is None else of(b.limit.rim_speed) / float(b.contact.radius) for b in driven
+    ]
+    return fastest, np.array([of(b.limit.torque) for b in driven]), np.array([of(b.limit.torque_rate) for b in driven])
 
 
 def drive_gains(model: Model) -> np.ndarray:

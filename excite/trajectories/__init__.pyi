@@ -35,6 +35,12 @@ from .joint_search import (
     check_joint_motion as check_joint_motion,
     design_joint_motion as design_joint_motion,
 )
+from .lane import (
+    move_motion as move_motion,
+    place_along_lane as place_along_lane,
+    place_on_lane as place_on_lane,
+    simulate_on_lane as simulate_on_lane,
+)
 from .limits import (
     DURATION_LIMIT as DURATION_LIMIT,
     LIMITS as LIMITS,
@@ -51,12 +57,8 @@ from .limits import (
     keeps_motion_limits as keeps_motion_limits,
     lane_excess as lane_excess,
     machine_limits as machine_limits,
-    move_motion as move_motion,
-    place_along_lane as place_along_lane,
-    place_on_lane as place_on_lane,
     rest_tolerances as rest_tolerances,
     resting_coordinates as resting_coordinates,
-    simulate_on_lane as simulate_on_lane,
     stack_limits as stack_limits,
 )
 from .multistart import (

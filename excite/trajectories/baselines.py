@@ -31,7 +31,12 @@ from excite.model import Model, mechanics
 from excite.model.machine import Body, Problem
 from excite.simulation import Motion, follow, left_turn_sign, simulate
 from excite.trajectories import excitation, interior_point, objective
-from excite.trajectories.collocation import solve_states, transcribe
+from excite.trajectories.collocation import (
+    rest_band_factor,
+    solve_states,
+    transcribe,
+    widen_transitions,
+)
 from excite.trajectories.composite_objective import compose_objective
 from excite.trajectories.continuation import (
     LIMIT_MARGIN,
@@ -39,9 +44,7 @@ from excite.trajectories.continuation import (
     SearchState,
     bring_to_rest,
     evaluate_drive,
-    rest_band_factor,
     typical_sizes,
-    widen_transitions,
 )
 from excite.trajectories.excitation import Manoeuvre, scale_torques
 from excite.trajectories.limits import (

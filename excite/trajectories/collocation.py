@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi as ca
@@ -17,7 +17,7 @@ import numpy as np
 
 from excite.errors import CollocationError
 from excite.model import Model
-from excite.model.machine import Problem
+from excite.model.machine import Machine, Problem
 from excite.simulation import Motion
 from excite.trajectories.limits import (
     REST_POSITION,
@@ -317,68 +317,27 @@ def transcribe(
     s = sample_symbols(model)
     moved = _limits_depending_on(every, s, ca.vertcat(s.q, s.nu))
     deferred = set() if with_pose else {g.name for g in every if is_lane_limit(g.name)}
-    staged = [g for g in every if g.name in moved and g.name not in deferred]
-    steered = [g for g in every if g.name not in moved and g.name not in deferred]
+    staged = [g for g in every if g.name in moved - deferred]
+    steered = [g for g in every if g.name not in moved | deferred]
     pose = model.machine.body[0].coordinates if with_pose else ()
-    needed = {*pose, *model.active_coordinates, *(model.coordinates[k] for k in resting_coordinates(model))}
-    used = [c for c in model.coordinates if c in needed]
+    resting = [model.coordinates[k] for k in resting_coordinates(model)]
+    used = [c for c in model.coordinates if c in {*pose, *model.active_coordinates, *resting}]
     names = (*used, *[c + "'" for c in model.coordinates], *model.memory[: model.n_dynamic_memory])
     z_size = np.array([state_size[c] for c in names])
     u_size = np.array([float(b.limit.torque) if b.limit.torque is not None else 1.0 for b in model.machine.actuated])
     interval_s = float(problem.duration_s) / intervals
     node_position, derivative, weight = radau_scheme(elements)
+    blocks = np.ones((1, len(model.coordinates))) if weights is None else weights
+    one = _sample_functions(model, used, z_size, u_size, interval_s, staged, blocks)
 
-    n_z, n_q, n_u = len(names), len(model.coordinates), len(u_size)
-    sample = ca.SX.sym("s", 2 * n_z + n_u)
-    z = sample[:n_z] * ca.DM(z_size)
-    rate = sample[n_z : 2 * n_z] * ca.DM(z_size) / interval_s
-    u = sample[2 * n_z :] * ca.DM(u_size)
-    q = ca.SX(n_q, 1)
-    for k, c in enumerate(used):
-        q[model.coordinates.index(c)] = z[k]
-    memory = len(used) + n_q
-    nu, a = (ca.vertcat(*ca.vertsplit(x)[len(used) : memory]) for x in (z, rate))
-    kept, kept_rate = (ca.vertcat(*ca.vertsplit(x)[memory:], ca.SX(0, 1)) for x in (z, rate))
-    map_values = ca.SX.sym("over", len(model.map_inputs))
-    beside = () if model.plain else (u, ca.vertcat(kept, map_values))
-    p = model.expand @ model.nominal
-    dq = model.kinematics(q, nu)[0]
-    turns = [(rate[k] - dq[model.coordinates.index(c)]) * interval_s / z_size[k] for k, c in enumerate(used)]
-    flow = model.flow(q, nu, u, ca.vertcat(kept, map_values), model.nominal)[: len(names) - memory]
-    going = (kept_rate - flow) * interval_s / ca.DM(z_size[memory:])
-    balance = (model.balance(q, nu, a, p, *beside) - model.joint_torques(u)) / float(u_size.max())
-    residual = ca.vertcat(*turns, balance, going)
-    g = ca.vertcat(*[(g.expression(q, nu, u, 0) - g.centre) * (2 / g.range) for g in staged], ca.SX(0, 1))
-    W = model.regressor(q, nu, a, *beside)
-    Phi = ca.mtimes(W, ca.diag(ca.DM(model.scale)))
-    blocks = np.ones((1, n_q)) if weights is None else weights
-    every_A = [ca.triu(ca.mtimes(P.T, P)) for P in (ca.mtimes(ca.diag(ca.DM(w)), Phi) for w in blocks)]
-    rows, columns = (np.array(x) for x in ca.triu(ca.mtimes(Phi.T, Phi)).sparsity().get_triplet())
-    entries = ca.vertcat(*[x for A in every_A for x in A.nonzeros()], ca.SX(0, 1))
-
-    n_s, n_g, n_a = 2 * n_z + n_u, g.numel(), entries.numel()
-    multipliers = ca.SX.sym("m", n_z + n_g + n_a)
-    lagrangian = ca.dot(multipliers, ca.vertcat(residual, g, entries))
-    H, _ = ca.hessian(lagrangian, sample)
-    N = intervals * len(node_position)
+    n_z, n_g, n_a = (one.values.numel_out(k) for k in range(3))
+    n_s, N = one.values.numel_in(0), intervals * len(node_position)
     samples = float(problem.duration_s) * float(model.machine.sampling_hz)
-    options = {"cse": True}
-    values = ca.Function("values", [sample, map_values], [residual, g, entries], options)
-    slopes = [ca.densify(ca.jacobian(x, sample).T) for x in (residual, g)]
-    entry_slope = ca.jacobian(entries, sample)
-    entry_of, entry_by = (np.array(x, int) for x in entry_slope.sparsity().get_triplet())
-    nonzeros = ca.vertcat(*entry_slope.nonzeros(), ca.SX(0, 1))
-    first_derivatives = ca.Function("first", [sample, map_values], [residual, g, entries, *slopes, nonzeros], options)
-    residual_slope = ca.Function("step", [sample, map_values], [residual, slopes[0]], options)
-    lagrangian_hessian = ca.Function("second", [sample, map_values, multipliers], [ca.densify(H)], options)
-
     nodes = ((np.arange(intervals)[:, None] + node_position) * interval_s).ravel()
     told = motion.memory[:, model.n_dynamic_memory :]
     torque_rows, torque_centre = _torque_limit_rows(steered, s, u_size, interval_s)
-    resting_states = [names.index(model.coordinates[k]) for k in resting_coordinates(model)] + [
-        names.index(c + "'") for c in model.coordinates
-    ]
-    still = np.concatenate([np.full(len(resting_coordinates(model)), REST_POSITION), rest_tolerances(model)])
+    resting_states = [names.index(c) for c in (*resting, *(c + "'" for c in model.coordinates))]
+    still = np.concatenate([np.full(len(resting), REST_POSITION), rest_tolerances(model)])
     rest_states = np.array(resting_states if problem.rest else [], int)
     rest_band = (rest_factor * REST_SHARE * still / z_size[resting_states])[: len(rest_states)]
     return Transcription(
@@ -396,23 +355,102 @@ def transcribe(
         tuple(x.name for x in steered),
         torque_rows,
         torque_centre,
-        rows,
-        columns,
+        one.rows,
+        one.columns,
         len(model.scale),
         len(blocks),
         rest_states,
         rest_band,
         np.array([k for k, c in enumerate(names) if c in pose and k not in resting_states], int),
-        _sample_map(node_position, derivative, n_z, n_u),
+        _sample_map(node_position, derivative, n_z, len(u_size)),
         np.array([np.interp(nodes, motion.t, x) for x in told.T]).T.reshape(N, -1),
+        one.entry_of,
+        one.entry_by,
+        MappedFunction(one.values, N, [(n_z,), (n_g,), (n_a,)]),
+        MappedFunction(one.first, N, [(n_z,), (n_g,), (n_a,), (n_z, n_s), (n_g, n_s), (len(one.entry_of),)]),
+        MappedFunction(one.second, N, [(n_s, n_s)]),
+        MappedFunction(one.residual, N, [(n_z,)]),
+        MappedFunction(one.step, N, [(n_z,), (n_z, n_s)]),
+        MappedFunction(one.step, len(node_position), [(n_z,), (n_z, n_s)]),
+    )
+
+
+@dataclass(frozen=True)
+class _SampleFunctions:
+    """Functions of a node's sample s and of values from a map of the ground.
+
+    values: residual of the equations of motion, limits and entries of information matrices, scaled; first: these and
+    their slopes; second: Hessian of the Lagrangian, given multipliers as well; residual: alone; step: with its slope.
+    rows, columns: places of the entries in their matrix. entry_of, entry_by: non-zeros of the entries' slope.
+    """
+
+    values: ca.Function
+    first: ca.Function
+    second: ca.Function
+    residual: ca.Function
+    step: ca.Function
+    rows: np.ndarray
+    columns: np.ndarray
+    entry_of: np.ndarray
+    entry_by: np.ndarray
+
+
+def _sample_functions(
+    model: Model,
+    used: Sequence[str],
+    z_size: np.ndarray,
+    u_size: np.ndarray,
+    interval_s: float,
+    limits: Sequence[Limit],
+    blocks: np.ndarray,
+) -> _SampleFunctions:
+    """Build the functions of a node's sample from coordinates that are used, sizes of states and torques, and limits.
+
+    blocks (n_blocks, n_rows) [1/SI]: factors of the regressor's rows, one information matrix each.
+    """
+    n_z, n_q, n_u = len(z_size), len(model.coordinates), len(u_size)
+    sample = ca.SX.sym("s", 2 * n_z + n_u)
+    z = sample[:n_z] * ca.DM(z_size)
+    rate = sample[n_z : 2 * n_z] * ca.DM(z_size) / interval_s
+    u = sample[2 * n_z :] * ca.DM(u_size)
+    q = ca.SX(n_q, 1)
+    for k, c in enumerate(used):
+        q[model.coordinates.index(c)] = z[k]
+    memory = len(used) + n_q
+    nu, a = (ca.vertcat(*ca.vertsplit(x)[len(used) : memory]) for x in (z, rate))
+    kept, kept_rate = (ca.vertcat(*ca.vertsplit(x)[memory:], ca.SX(0, 1)) for x in (z, rate))
+    map_values = ca.SX.sym("over", len(model.map_inputs))
+    beside = () if model.plain else (u, ca.vertcat(kept, map_values))
+    p = model.expand @ model.nominal
+    dq = model.kinematics(q, nu)[0]
+    turns = [(rate[k] - dq[model.coordinates.index(c)]) * interval_s / z_size[k] for k, c in enumerate(used)]
+    flow = model.flow(q, nu, u, ca.vertcat(kept, map_values), model.nominal)[: n_z - memory]
+    going = (kept_rate - flow) * interval_s / ca.DM(z_size[memory:])
+    balance = (model.balance(q, nu, a, p, *beside) - model.joint_torques(u)) / float(u_size.max())
+    residual = ca.vertcat(*turns, balance, going)
+    g = ca.vertcat(*[(g.expression(q, nu, u, 0) - g.centre) * (2 / g.range) for g in limits], ca.SX(0, 1))
+    Phi = ca.mtimes(model.regressor(q, nu, a, *beside), ca.diag(ca.DM(model.scale)))
+    every_A = [ca.triu(ca.mtimes(P.T, P)) for P in (ca.mtimes(ca.diag(ca.DM(w)), Phi) for w in blocks)]
+    rows, columns = (np.array(x) for x in ca.triu(ca.mtimes(Phi.T, Phi)).sparsity().get_triplet())
+    entries = ca.vertcat(*[x for A in every_A for x in A.nonzeros()], ca.SX(0, 1))
+
+    multipliers = ca.SX.sym("m", n_z + g.numel() + entries.numel())
+    H, _ = ca.hessian(ca.dot(multipliers, ca.vertcat(residual, g, entries)), sample)
+    slopes = [ca.densify(ca.jacobian(x, sample).T) for x in (residual, g)]
+    entry_slope = ca.jacobian(entries, sample)
+    entry_of, entry_by = (np.array(x, int) for x in entry_slope.sparsity().get_triplet())
+    nonzeros = ca.vertcat(*entry_slope.nonzeros(), ca.SX(0, 1))
+    given, options = [sample, map_values], {"cse": True}
+    return _SampleFunctions(
+        ca.Function("values", given, [residual, g, entries], options),
+        ca.Function("first", given, [residual, g, entries, *slopes, nonzeros], options),
+        ca.Function("second", [*given, multipliers], [ca.densify(H)], options),
+        ca.Function("residual", given, [residual], options),
+        ca.Function("step", given, [residual, slopes[0]], options),
+        rows,
+        columns,
         entry_of,
         entry_by,
-        MappedFunction(values, N, [(n_z,), (n_g,), (n_a,)]),
-        MappedFunction(first_derivatives, N, [(n_z,), (n_g,), (n_a,), (n_z, n_s), (n_g, n_s), (len(entry_of),)]),
-        MappedFunction(lagrangian_hessian, N, [(n_s, n_s)]),
-        MappedFunction(ca.Function("residual", [sample, map_values], [residual], options), N, [(n_z,)]),
-        MappedFunction(residual_slope, N, [(n_z,), (n_z, n_s)]),
-        MappedFunction(residual_slope, len(node_position), [(n_z,), (n_z, n_s)]),
     )
 
 
@@ -434,3 +472,30 @@ def _torque_limit_rows(
         rows.append(np.concatenate([-by_du / interval_s, by_u + by_du / interval_s]) * np.tile(u_size, 2) * 2 / g.range)
         centres.append(-2 * g.centre / g.range)
     return np.array(rows).reshape(-1, 2 * n_u), np.array(centres)
+
+
+def rest_band_factor(friction: float) -> float:
+    """Return the factor on the tolerance of rest for wider friction transitions.
+
+    Near standstill, softened friction only damps, and the speed that remains at the end grows with the transition's
+    width.
+    """
+    return 2 * friction if friction > 1 else 1.0
+
+
+def widen_transitions(model: Model, friction: float, slip: float) -> Model:
+    """Return the model with wider transitions of friction and slip at standstill."""
+    if friction == 1 and slip == 1:
+        return model
+    bodies = []
+    for body in model.machine.body:
+        changed: dict[str, object] = {}
+        if body.friction is not None:
+            wider = body.friction.smoothing.model_copy(update={"value": friction * float(body.friction.smoothing)})
+            changed["friction"] = body.friction.model_copy(update={"smoothing": wider})
+        if body.contact is not None:
+            wider = body.contact.v_eps.model_copy(update={"value": slip * float(body.contact.v_eps)})
+            changed["contact"] = body.contact.model_copy(update={"v_eps": wider})
+        bodies.append(body.model_copy(update=changed))
+    machine: Machine = model.machine.model_copy(update={"body": tuple(bodies)})
+    return replace(model.for_machine(machine), nominal=model.nominal, scale=model.scale)

@@ -14,12 +14,19 @@ import numpy as np
 
 from excite.errors import CollocationError, SimulationError
 from excite.model import Model
-from excite.model.machine import Machine, Problem
+from excite.model.machine import Problem
 from excite.simulation import Motion, simulate, track_motion
 from excite.trajectories import composite_objective, interior_point, ipopt, objective as objectives
-from excite.trajectories.collocation import Transcription, solve_states, transcribe
+from excite.trajectories.collocation import (
+    Transcription,
+    rest_band_factor,
+    solve_states,
+    transcribe,
+    widen_transitions,
+)
 from excite.trajectories.composite_objective import COND_MAX, SIGMA_MAX, CompositeObjective
 from excite.trajectories.excitation import Manoeuvre, knot_times, multisine, scale_torques
+from excite.trajectories.lane import simulate_on_lane
 from excite.trajectories.limits import (
     REST_POSITION,
     REST_SPEED,
@@ -34,7 +41,6 @@ from excite.trajectories.limits import (
     machine_limits,
     rest_tolerances,
     resting_coordinates,
-    simulate_on_lane,
     travel_directions,
 )
 
@@ -366,15 +372,7 @@ def _run_stage(
     should_stop: Callable[[], bool],
 ) -> SearchState | None:
     """Run one stage; None if no motion follows the torques or the information is singular."""
-    wanted = objective
-    if stage.friction == 1:
-        ratio = composite_objective.surrogate_ratio(objective, model, state.motion)
-        if ratio is not None:
-            careful = _damped_ratio(ratio, state.surrogate_ratio)
-            state, wanted = (
-                replace(state, surrogate_ratio=careful),
-                composite_objective.calibrate_surrogates(objective, careful),
-            )
+    state, wanted = _calibrate(model, objective, state) if stage.friction == 1 else (state, objective)
     wanted = composite_objective.lower_ceilings(wanted, max(margins.get(x, 0.0) for x in (SIGMA_MAX, COND_MAX)))
     times = knot_times(problem, stage.coarse)
     intervals = len(times) - 1
@@ -393,20 +391,7 @@ def _run_stage(
     nodes = (np.arange(intervals)[:, None] + tr.node_position) * tr.interval_s
     U = state.latest.manoeuvre.at(times) / tr.torque_scale
     U[0] = U[-1] = 0.0
-    start = np.zeros(tr.n_z)
-    if state.start_pose is not None:
-        for k, c in enumerate(tr.state_names):
-            start[k] = (
-                state.start_pose[model.coordinates.index(c)] / tr.state_scale[k] if c in model.coordinates else 0.0
-            )
-    fresh = state.node_states is None
-    if state.node_states is None or state.node_states.shape[1] != tr.n_z:
-        names = [*model.coordinates, *[c + "'" for c in model.coordinates], *model.memory]
-        every = np.hstack([state.motion.q, state.motion.nu, state.motion.memory])
-        columns = [every[:, names.index(c)] / size for c, size in zip(tr.state_names, tr.state_scale, strict=True)]
-        Z = np.stack([np.interp(nodes, state.motion.t, x) for x in columns], axis=-1)
-    else:
-        Z = np.stack([np.interp(nodes, state.times, x) for x in state.node_states.T], axis=-1)
+    start, Z = _begin(model, state, tr, nodes)
     moved_in = np.array([LIMIT_MARGIN + 2 * margins.get(name, 0.0) for name in tr.limit_names])
     task = interior_point.Subproblem(
         wanted,
@@ -435,7 +420,9 @@ def _run_stage(
         return should_stop()
 
     try:
-        solution = SOLVERS[state.solver](StageProgram(tr, task, start, Z, U, levels, fresh, stage), count_and_stop)
+        solution = SOLVERS[state.solver](
+            StageProgram(tr, task, start, Z, U, levels, state.node_states is None, stage), count_and_stop
+        )
     except np.linalg.LinAlgError:  # singular information: the machine hardly moves
         return None
     try:
@@ -452,6 +439,21 @@ def _run_stage(
         iterations=state.iterations + asked,
         failure=solution.failure,
     )
+
+
+def _begin(model: Model, state: SearchState, tr: Transcription, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return start (n_z,) and states (K, J, n_z), scaled, that a stage begins with at times `nodes` (K, J) [s]."""
+    start = np.zeros(tr.n_z)
+    if state.start_pose is not None:
+        for k, c in enumerate(tr.state_names):
+            if c in model.coordinates:
+                start[k] = state.start_pose[model.coordinates.index(c)] / tr.state_scale[k]
+    if state.node_states is not None and state.node_states.shape[1] == tr.n_z:
+        return start, np.stack([np.interp(nodes, state.times, x) for x in state.node_states.T], axis=-1)
+    names = [*model.coordinates, *[c + "'" for c in model.coordinates], *model.memory]
+    every = np.hstack([state.motion.q, state.motion.nu, state.motion.memory])
+    columns = [every[:, names.index(c)] / size for c, size in zip(tr.state_names, tr.state_scale, strict=True)]
+    return start, np.stack([np.interp(nodes, state.motion.t, x) for x in columns], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -520,6 +522,17 @@ def _solve_with_ipopt(program: StageProgram, should_stop: Callable[[], bool]) ->
 SOLVERS: dict[str, Solver] = {"own": _solve_own, "ipopt": _solve_with_ipopt}
 
 
+def _calibrate(
+    model: Model, objective: CompositeObjective, state: SearchState
+) -> tuple[SearchState, CompositeObjective]:
+    """Return state and objective with surrogates as far from what they stand for as at the state's motion."""
+    ratio = composite_objective.surrogate_ratio(objective, model, state.motion)
+    if ratio is None:
+        return state, objective
+    careful = _damped_ratio(ratio, state.surrogate_ratio)
+    return replace(state, surrogate_ratio=careful), composite_objective.calibrate_surrogates(objective, careful)
+
+
 def _damped_ratio(ratio: np.ndarray, before: np.ndarray | None) -> np.ndarray:
     """Extrapolate half of a growth of the surrogate ratio and take half of a decline, in logarithms.
 
@@ -568,30 +581,3 @@ def evaluate_drive(
     if objective.cond_max is not None:
         violations[COND_MAX] = max(0.0, objectives.cond_phi(model, motion) / objective.cond_max - 1)
     return ScoredDrive(drive, motion.q[0], judged.score, violations), motion
-
-
-def rest_band_factor(friction: float) -> float:
-    """Return the factor on the tolerance of rest for wider friction transitions.
-
-    Near standstill, softened friction only damps, and the speed that remains at the end grows with the transition's
-    width.
-    """
-    return 2 * friction if friction > 1 else 1.0
-
-
-def widen_transitions(model: Model, friction: float, slip: float) -> Model:
-    """Return the model with wider transitions of friction and slip at standstill."""
-    if friction == 1 and slip == 1:
-        return model
-    bodies = []
-    for body in model.machine.body:
-        changed: dict[str, object] = {}
-        if body.friction is not None:
-            wider = body.friction.smoothing.model_copy(update={"value": friction * float(body.friction.smoothing)})
-            changed["friction"] = body.friction.model_copy(update={"smoothing": wider})
-        if body.contact is not None:
-            wider = body.contact.v_eps.model_copy(update={"value": slip * float(body.contact.v_eps)})
-            changed["contact"] = body.contact.model_copy(update={"v_eps": wider})
-        bodies.append(body.model_copy(update=changed))
-    machine: Machine = model.machine.model_copy(update={"body": tuple(bodies)})
-    return replace(model.for_machine(machine), nominal=model.nominal, scale=model.scale)

@@ -44,14 +44,8 @@ from excite.trajectories.continuation import (
     start_from_multisine,
 )
 from excite.trajectories.excitation import Manoeuvre
-from excite.trajectories.limits import (
-    LIGHTEN,
-    describe_excess,
-    describe_overload,
-    end_poses,
-    move_motion,
-    place_along_lane,
-)
+from excite.trajectories.lane import move_motion, place_along_lane
+from excite.trajectories.limits import LIGHTEN, describe_excess, describe_overload, end_poses
 
 
 class BestSoFar(float):

@@ -11,7 +11,8 @@ from excite.model.machine import Problem
 from excite.simulation import Motion, play_back, share_outside_law
 from excite.trajectories import objective
 from excite.trajectories.composite_objective import compose_objective, sigma_percent
-from excite.trajectories.limits import DURATION_LIMIT, check_limits, simulate_on_lane
+from excite.trajectories.lane import simulate_on_lane
+from excite.trajectories.limits import DURATION_LIMIT, check_limits
 
 
 @dataclass(frozen=True)

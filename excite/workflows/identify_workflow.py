@@ -115,11 +115,6 @@ def identify(
     return identify_account(as_in_file, ready, found, unfitted, more_notes, before, accepted).write(place)
 
 
-def _as_compared(comparison: SignalComparison) -> SignalComparison:
-    """Return a comparison that is made already."""
-    return comparison
-
-
 def identify_account(
     as_in_file: Model,
     ready: Prepared,
@@ -189,25 +184,7 @@ def identify_account(
         }
     if unloaded is not None:
         summary["payload"] = _payload(identification.payload_parameters(model, estimate, unloaded))
-    fits: list[tuple[str, list[tuple[Log, Callable[[], SignalComparison]]]]] = [
-        ("fit", [(one, partial(_as_compared, c)) for one, c in zip(read, compared, strict=True)]),
-        (
-            "validation",
-            [(one, partial(identification.compare_torques, model, one, estimate, chosen)) for one in unfitted],
-        ),
-    ]
-    figures = {
-        f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png": partial(_fit_figure, model, one, compare)
-        for kind, several in fits
-        for k, (one, compare) in enumerate(several)
-    }
-    title = f"{model.machine.title}, {estimate.method}"
-    if estimate.status != "invalid" and np.isfinite(estimate.std).any():
-        figures["correlation.png"] = partial(reports.correlation_figure, estimate, title)
-        if estimate.tolerated:
-            figures["budget.png"] = partial(reports.budget_figure, estimate, title)
-        if estimate.prior_std is not None and (np.isfinite(estimate.prior_std) & (estimate.prior_std > 0)).any():
-            figures["prior.png"] = partial(reports.prior_figure, estimate, as_in_file.nominal, title)
+    figures = _figures(model, found, estimate, compared, unfitted, as_in_file.nominal)
     return Account(
         "identify",
         reports.with_sentences("identify", summary),
@@ -217,8 +194,40 @@ def identify_account(
     )
 
 
-def _fit_figure(model: Model, one: Log, compare: Callable[[], SignalComparison]) -> Figure:
-    return reports.comparison_figure(model, compare(), f"{model.machine.title}: {one.source}")
+def _figures(
+    model: Model,
+    found: IdentifyResult,
+    estimate: Estimate,
+    compared: Sequence[SignalComparison],
+    unfitted: Sequence[Log],
+    nominal: np.ndarray,
+) -> dict[str, Callable[[], Figure]]:
+    """Return what draws each figure, by file name. nominal (n,): values of the machine file."""
+    every: tuple[tuple[str, list[Callable[[], Figure]]], ...] = (
+        ("fit", [partial(_fit_figure, model, *both) for both in zip(found.logs, compared, strict=True)]),
+        ("validation", [partial(_validation_figure, model, one, estimate, found.filter) for one in unfitted]),
+    )
+    figures = {
+        f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png": draw
+        for kind, several in every
+        for k, draw in enumerate(several)
+    }
+    title = f"{model.machine.title}, {estimate.method}"
+    if estimate.status != "invalid" and np.isfinite(estimate.std).any():
+        figures["correlation.png"] = partial(reports.correlation_figure, estimate, title)
+        if estimate.tolerated:
+            figures["budget.png"] = partial(reports.budget_figure, estimate, title)
+        if estimate.prior_std is not None and (np.isfinite(estimate.prior_std) & (estimate.prior_std > 0)).any():
+            figures["prior.png"] = partial(reports.prior_figure, estimate, nominal, title)
+    return figures
+
+
+def _validation_figure(model: Model, one: Log, estimate: Estimate, filter: Filter) -> Figure:
+    return _fit_figure(model, one, identification.compare_torques(model, one, estimate, filter))
+
+
+def _fit_figure(model: Model, one: Log, compared: SignalComparison) -> Figure:
+    return reports.comparison_figure(model, compared, f"{model.machine.title}: {one.source}")
 
 
 def _discrepancy(estimate: Estimate) -> dict[str, Any]:

@@ -22,6 +22,7 @@ OF_STRAIGHT_JOINTS = {
     "rad/s": "m/s",
     "rad/(N m)": "m/N",
 }  # units of a sliding joint for those of one that turns
+EDGE_TIME = 0.2  # s, duration of the start and end of a temporary effect; chosen
 DEFAULT_DURATION = 60.0  # s, length of a log if none is given; chosen
 Values = Mapping[str, ca.SX]  # magnitude "A" and shapes by name
 Form = tuple[str, float]  # name of a shape that selects one form of an effect, and its value
@@ -183,6 +184,19 @@ class Shape:
     def signed(self) -> bool:
         """True if it may have either sign: a phase, zero by default, or declared so."""
         return self.circular or self.default == 0 or self.either_sign
+
+
+PHASE = Shape("rad", 0.0, (0.0, math.pi / 2), circular=True)
+
+
+def form_choice(meaning: str, only: tuple[float, ...] = (0.0, 1.0), grid: tuple[float, ...] = (0.0,)) -> Shape:
+    """Declare a shape that selects one of several forms of an effect."""
+    return Shape("-", 0.0, grid, whole=True, only=only, meaning=meaning)
+
+
+def between(t: ca.SX, begin: ca.SX, end: ca.SX) -> ca.SX:
+    """Return 1 between two instants, 0 outside, with edges of EDGE_TIME."""
+    return (ca.tanh((t - begin) / EDGE_TIME) - ca.tanh((t - end) / EDGE_TIME)) / 2
 
 
 @dataclass(frozen=True)

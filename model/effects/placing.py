@@ -15,49 +15,62 @@ from excite.model.effects.effect import DEFAULT_DURATION, Effect, PlacedEffect, 
 from excite.model.machine import Body, EffectEntry, Machine, Quantity, Sensor
 from excite.text import format_number
 
+Place = tuple[tuple[int, ...], tuple[str, ...]]  # indices of bodies, names of sensors
+
 SUSPICIOUS_RATIO = 50.0  # multiple of the typical magnitude that suggests a wrong unit; chosen
 MIN_TYPICAL_FRICTION = 1e-5  # N m, friction below this is no reference for others; chosen
 
 
-def allowed_places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...], tuple[str, ...]]]:
+def allowed_places(machine: Machine, effect: Effect) -> dict[str, Place]:
     """Return the places where a machine may have an effect: name -> (indices of bodies, names of sensors)."""
-    driven = list(machine.actuated)
-    pulling = [b for b in driven if b.contact is not None]
-    together = machine.contacts if effect.soil else pulling
-    each = {
-        "joints": list(machine.rubbing),
-        "drives": driven,
-        "contacts": machine.contacts,
-        "driven_contacts": pulling,
-        "articulation": [b for b in driven if b.contact is None],
-        "free_drives": [] if machine.contacts else driven,
-        "links": [] if machine.contacts else [b for b in machine.body if _has_link(b)],
-    }
     sensors = [s for s in machine.sensors("full") if not (effect.angle_only and s.is_rate)]
-    root = machine.body[0].index
-    wheels = [s for s in sensors if s.kind == "wheel"]
-    found: dict[str, tuple[tuple[int, ...], tuple[str, ...]]] = {}
+    each, whole = _bodies_of_places(machine), _single_places(machine, effect, sensors)
+    found: dict[str, Place] = {}
     for place in effect.places:
-        if place in each:
-            found |= {b.where: ((b.index,), _angle_sensor(sensors, b)) for b in each[place]}
-        elif place == "drive" and len(together) > 1:
-            found["drive"] = tuple(b.index for b in together), ()
-        elif place == "contact_group" and len(machine.contacts) > 1:
-            found["contacts"] = tuple(b.index for b in machine.contacts), ()
-        elif place == "wheels":
-            found |= {s.place or s.name: ((s.body,), (s.name,)) for s in wheels}
-        elif place == "wheel_pair" and len(wheels) > 1:
-            found["measuring_wheels"] = (wheels[0].body,), tuple(s.name for s in wheels)
-        elif place in ("yaw_rate", "lateral_speed"):
-            found |= {s.place or place: ((s.body,), (s.name,)) for s in sensors if s.kind == place}
-        elif place == "machine" and _has_place(machine, effect):
-            found["machine"] = (root,), ()
+        found |= {b.where: ((b.index,), _angle_sensor(sensors, b)) for b in each.get(place, ())}
+        found |= whole.get(place, {})
     if effect.soil or effect.push:
         found = {w: at for w, at in found.items() if all(machine.find(k).contact for k in at[0])}
     if effect.angle_only:
         found = {w: at for w, at in found.items() if at[1]}
     if any(shape.circular for shape in effect.shapes.values()):  # a phase has no meaning at a sliding joint
         found = {w: at for w, at in found.items() if w == "machine" or not is_straight(machine, at[0])}
+    return found
+
+
+def _bodies_of_places(machine: Machine) -> dict[str, Sequence[Body]]:
+    """Return the bodies by kinds of place at which each may have an effect of its own."""
+    driven = machine.actuated
+    return {
+        "joints": machine.rubbing,
+        "drives": driven,
+        "contacts": machine.contacts,
+        "driven_contacts": [b for b in driven if b.contact is not None],
+        "articulation": [b for b in driven if b.contact is None],
+        "free_drives": () if machine.contacts else driven,
+        "links": () if machine.contacts else [b for b in machine.body if _has_link(b)],
+    }
+
+
+def _single_places(machine: Machine, effect: Effect, sensors: Sequence[Sensor]) -> dict[str, dict[str, Place]]:
+    """Return the places that are several bodies, sensors, or the machine as a whole, by kind of place."""
+    pulling = [b for b in machine.actuated if b.contact is not None]
+    together = tuple(b.index for b in (machine.contacts if effect.soil else pulling))
+    contacts = tuple(b.index for b in machine.contacts)
+    wheels = [s for s in sensors if s.kind == "wheel"]
+    found: dict[str, dict[str, Place]] = {
+        kind: {s.place or kind: ((s.body,), (s.name,)) for s in sensors if s.kind == kind}
+        for kind in ("yaw_rate", "lateral_speed")
+    }
+    found["wheels"] = {s.place or s.name: ((s.body,), (s.name,)) for s in wheels}
+    if len(wheels) > 1:
+        found["wheel_pair"] = {"measuring_wheels": ((wheels[0].body,), tuple(s.name for s in wheels))}
+    if len(together) > 1:
+        found["drive"] = {"drive": (together, ())}
+    if len(contacts) > 1:
+        found["contact_group"] = {"contacts": (contacts, ())}
+    if _has_place(machine, effect):
+        found["machine"] = {"machine": ((machine.body[0].index,), ())}
     return found
 
 
@@ -161,13 +174,7 @@ def place_effect(machine: Machine, entry: EffectEntry, duration: float = DEFAULT
     duration [s]: length of the log; defaults of some shapes are shares of it.
     Raises MachineError for an unknown name, place or shape, or a value out of range.
     """
-    effect = CATALOGUE.get(entry.name)
-    if effect is None:
-        parts = {part for part in entry.name.split("_") if len(part) > 2}
-        like = difflib.get_close_matches(entry.name, CATALOGUE, n=3)
-        like = like or [n for n in CATALOGUE if parts & set(n.split("_"))]
-        hint = f", is {' or '.join(like)} meant?" if like else ":"
-        raise MachineError(f"{machine.name}: effect {entry.name}: unknown{hint} `excite docs` lists all")
+    effect = _known_effect(machine, entry.name)
     allowed = allowed_places(machine, effect)
     where = entry.where or (next(iter(allowed)) if len(allowed) == 1 else "")
     if where not in allowed:
@@ -184,7 +191,31 @@ def place_effect(machine: Machine, entry: EffectEntry, duration: float = DEFAULT
     if effect.sensor_only and not sensors:
         raise MachineError(f"{machine.name}: effect {entry.name}: {where} has no sensor that it could sit in")
     site = Site.of(machine, bodies, duration)
-    values = {"A": float(entry.amount)}
+    values = {"A": float(entry.amount)} | _shape_values(machine, effect, entry, site)
+    made = PlacedEffect(effect, where, bodies, sensors, values, is_straight(machine, bodies))
+    for name, shape in made.shapes.items():
+        # Identified shapes are positive already; an instant may be the start of the log.
+        stated = name in entry.shape and entry.shape[name].source != "identified"
+        least = 0 in shape.grid or shape.size is sizes.duration
+        if stated and not (shape.signed or shape.only) and (values[name] < 0 or (values[name] == 0 and not least)):
+            raise MachineError(f"{machine.name}: effect {entry.name}: shape {name} must be > 0 (got {values[name]:g})")
+    return made
+
+
+def _known_effect(machine: Machine, name: str) -> Effect:
+    """Return the effect of this name. Raises MachineError with names like it."""
+    if name in CATALOGUE:
+        return CATALOGUE[name]
+    parts = {part for part in name.split("_") if len(part) > 2}
+    like = difflib.get_close_matches(name, CATALOGUE, n=3)
+    like = like or [n for n in CATALOGUE if parts & set(n.split("_"))]
+    hint = f", is {' or '.join(like)} meant?" if like else ":"
+    raise MachineError(f"{machine.name}: effect {name}: unknown{hint} `excite docs` lists all")
+
+
+def _shape_values(machine: Machine, effect: Effect, entry: EffectEntry, site: Site) -> dict[str, float]:
+    """Return the shapes of an entry, by default those of the effect. Raises MachineError for one that can't be."""
+    values = {}
     for name, shape in effect.shapes.items():
         given = entry.shape.get(name)
         values[name] = float(given) if given is not None else shape.default * shape.size(site)
@@ -193,12 +224,4 @@ def place_effect(machine: Machine, entry: EffectEntry, duration: float = DEFAULT
             raise MachineError(
                 f"{machine.name}: effect {entry.name}: shape {name} must be one of {options} (got {values[name]:g})"
             )
-    made = PlacedEffect(effect, where, bodies, sensors, values, is_straight(machine, bodies))
-    for name, shape in made.shapes.items():
-        stated = (
-            name in entry.shape and entry.shape[name].source != "identified"
-        )  # identified shapes are positive already
-        least = 0 in shape.grid or shape.size is sizes.duration  # an instant may be the start of the log
-        if stated and not (shape.signed or shape.only) and (values[name] < 0 or (values[name] == 0 and not least)):
-            raise MachineError(f"{machine.name}: effect {entry.name}: shape {name} must be > 0 (got {values[name]:g})")
-    return made
+    return values

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from excite.model.machine import hydraulics, units
-
-if TYPE_CHECKING:
-    from excite.model.machine.machine import Machine, Sensor
-
-IN_SI = "SI"  # noise_unit of a value in the SI unit of what the sensor measures: N m at the joint of a pressure in bar
-SI_QUANTITIES = {"torque": ("torque", "force"), "angle": ("angle", "length", "angular rate", "speed")}
+from excite.model.machine.machine import Machine
+from excite.model.machine.sensor import IN_SI, Sensor
 
 
 def si_per_number(machine: Machine, sensor: Sensor) -> float:
@@ -38,18 +32,3 @@ def noise_of(machine: Machine, sensor: Sensor) -> float:
     if sensor.factor is None and quantity == units.UNITS[sensor.unit][0]:
         return float(sensor.noise) * one / units.UNITS[sensor.unit][1] * si_per_number(machine, sensor)
     return float(sensor.noise) * one
-
-
-def wrong_noise_unit(sensor: Sensor) -> str:
-    """Say why a sensor's `noise_unit` is none, "" where it is one."""
-    unit = sensor.noise_unit
-    if unit is None or unit in (IN_SI, sensor.unit):
-        return ""
-    own = () if sensor.factor is not None else units.UNITS.get(sensor.unit, ("",))[:1]
-    allowed = (*own, *SI_QUANTITIES.get(sensor.kind, units.QUANTITIES_BY_KIND[sensor.kind]))
-    if units.UNITS.get(unit, ("",))[0] in allowed:
-        return ""
-    return (
-        f"noise_unit: {unit!r} is no unit of this sensor's noise: leave it out (noise is then in {sensor.unit}, the"
-        f' column\'s unit), or write "{IN_SI}"'
-    )

@@ -45,14 +45,14 @@ def test_without_a_command_help_is_shown(excite: Excite) -> None:
 
 @pytest.mark.slow
 def test_a_result_that_is_replaced_is_said(excite: Excite, tmp_path: Path) -> None:
-    asked = ("design", "va12_straight", "--duration", 12, "--starts", 1, "--out", tmp_path / "d")
+    asked = ("design", "va12_straight", "--duration", 8, "--starts", 1, "--out", tmp_path / "d")
     _, first, _ = excite(*asked, "--seed", 3)
     assert "will be replaced" not in first
     code, second, _ = excite(*asked, "--seed", 4)
     assert code == 0
     said, *_ = second.splitlines()
     assert said.startswith(f"{tmp_path / 'd'}/ will be replaced")
-    assert "(objective cond, duration 12 s, starts 1, seed 3)" in said
+    assert "(objective cond, duration 8 s, starts 1, seed 3)" in said
     _, third, _ = excite(*asked, "--json")
     json.loads(third)
 

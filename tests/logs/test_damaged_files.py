@@ -21,7 +21,7 @@ WANTED = (
     "Angle",
     "X_Value",
 )
-SIZES = [pytest.param(1, id="few"), pytest.param(20, id="many", marks=pytest.mark.slow)]  # files of each format
+SIZES = [pytest.param(1, id="few"), pytest.param(6, id="many", marks=pytest.mark.slow)]  # files of each format
 
 
 @pytest.fixture(scope="module")

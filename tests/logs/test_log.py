@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import pytest
 import scipy.io
 from support.commands import Excite
 
-from excite.logs import log, profile
+from excite.logs import log, prepare, profile
 from excite.model import Model
 from excite.simulation import Motion, sensors
 
@@ -192,11 +191,9 @@ def test_profile_has_the_contracts_columns(
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", MENDED)
-def test_what_can_be_mended_is_read_with_a_note(name: str, table: pd.DataFrame, tmp_path: Path, excite: Excite) -> None:
+def test_what_can_be_mended_is_read_with_a_note(name: str, table: pd.DataFrame, tmp_path: Path, va12: Model) -> None:
     make, words = MENDED[name]
-    path = make(table.copy(), tmp_path)
-    code, stdout, stderr = excite("identify", "va12", path, "--method", "ols", "--out", tmp_path / "out", "--json")
-    assert code == 0, stderr
-    assert any(words in note for note in json.loads(stdout)["notes"]), json.loads(stdout)["notes"]
+    ready = prepare(va12, [make(table.copy(), tmp_path)])
+    assert any(words in note for note in ready.notes), ready.notes
+    assert all(np.isfinite(values).all() for one in ready.logs for values in one.values.values())

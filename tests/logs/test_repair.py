@@ -12,7 +12,7 @@ from support.logs import make_log
 
 from excite.errors import LogError
 from excite.identification import delays, filter_choice, methods
-from excite.logs import Log, log, repair
+from excite.logs import Log, log, outliers, repair
 from excite.model import Model
 from excite.simulation import Motion
 
@@ -131,7 +131,7 @@ def test_what_stands_exactly_still_is_no_dropout(straight: Model, clean: Log) ->
     step = next(s.resolution for s in straight.machine.sensors("full") if s.name == "theta1")
     ramp = step * np.round(np.clip(np.arange(len(clean)) - 1500, 0, 200) * 9.3)
     for name, x in (("u1", zero), ("u1", steps), ("theta1", ramp)):
-        assert repair.find_dropouts(next(s for s in straight.machine.sensor if s.name == name), x) == (), name
+        assert outliers.find_dropouts(next(s for s in straight.machine.sensor if s.name == name), x) == (), name
 
 
 def test_late_channels_are_found_to_a_millisecond(straight: Model, clean: Log) -> None:

@@ -95,8 +95,6 @@ def test_a_held_channel_is_a_doubt(va12: Model) -> None:
     [
         ("T1_rate/rate1008.csv", 21, 1.0),
         ("T2_jitter/j2_walk.csv", 20, 3.5),
-        pytest.param("T1_rate/rate995.csv", 20, 1.5, marks=pytest.mark.slow),
-        pytest.param("T2_jitter/j1_jitter2ms.csv", 20, 3.5, marks=pytest.mark.slow),
         pytest.param("R2_held_channel/j9_imu_held5.csv", 20, 1.0, marks=pytest.mark.slow),
         pytest.param("R2_held_channel/j9_torque_held5.csv", 20, 5.0, marks=pytest.mark.slow),
     ],

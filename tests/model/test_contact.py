@@ -107,11 +107,6 @@ def quantity(value: float) -> dict[str, Any]:
     return {"value": value, "source": "assumed"}
 
 
-@pytest.fixture(scope="module")
-def va12() -> Model:
-    return build(load_machine("va12"))
-
-
 def parameters(model: Model, **changes: float) -> np.ndarray:
     """Standard parameters, changed by name or first letters."""
     table = {name: value for name, (value, _) in standard_parameters(model.machine).items()}

@@ -20,7 +20,6 @@ from excite.identification.joint import joint
 from excite.logs import Log
 from excite.model import Model, prediction
 from excite.model.effects import placing
-from excite.model.machine import machine
 from excite.simulation import Motion, follow, simulate
 from excite.smoothing import (
     PRIOR_STD,
@@ -39,16 +38,6 @@ from excite.smoothing import (
     uncertainty,
 )
 from excite.smoothing.measurements import beat_inflation
-
-
-@pytest.fixture(scope="module")
-def va12() -> Model:
-    return prediction.build(machine.load_machine("va12"))
-
-
-@pytest.fixture(scope="module")
-def straight() -> Model:
-    return prediction.build(machine.load_machine("va12_straight"))
 
 
 def energetic(seconds: float = 60.0, size: float = 1.0) -> np.ndarray:
@@ -212,11 +201,9 @@ def test_exact_signals_give_exact_parameters(va12: Model, kit: str) -> None:
     assert (np.abs(estimate.value - X) < 1e-4 * va12.scale).all()
 
 
-def errors(
-    model: Model, drive: str, kit: str, seeds: range, by: float = 0.2
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """True errors in standard deviations and in per cent (runs, n), and standard deviations over the bound."""
-    z, percent, over = [], [], []
+def errors(model: Model, drive: str, kit: str, seeds: range, by: float = 0.2) -> tuple[np.ndarray, np.ndarray]:
+    """True errors (runs, n) in standard deviations and in per cent."""
+    z, percent = [], []
     for seed in seeds:
         X = perturbed(model, seed, by)
         motion = simulate(model, energetic(), X) if drive == "energetic" else human(model, X, seed)
@@ -225,20 +212,7 @@ def errors(
         assert len(estimate.notes) == 1, estimate.notes
         z.append((estimate.value - X) / estimate.std)
         percent.append(100 * (estimate.value - X) / np.maximum(np.abs(X), model.scale))
-        over.append(estimate.std / np.sqrt(np.diag(smoothing.cramer_rao(model, motion, kit, X))))
-    return np.array(z), np.array(percent), np.array(over)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("drive", "kit"), [("energetic", "full"), ("human", "paper")])
-def test_errors_are_as_large_as_it_says(va12: Model, drive: str, kit: str) -> None:
-    z, percent, over = errors(va12, drive, kit, range(2))
-    assert 0.7 < np.sqrt(np.mean(z**2)) < 1.35
-    assert np.abs(z).max() < 4.5
-    assert np.median(np.sqrt(np.mean(percent**2, axis=0))) < 0.6
-    # The noise is estimated, and what counting does is each motion's own.
-    assert over.min() > 0.85
-    assert over.max() < 1.3
+    return np.array(z), np.array(percent)
 
 
 @pytest.mark.slow
@@ -246,7 +220,7 @@ def test_coverage(va12: Model) -> None:
     """Another machine, drive and noise each time, started from a file up to 20 % off: errors as large as said."""
     told = []
     for drive, kit, middle in (("energetic", "paper", 0.25), ("human", "full", 0.4)):
-        z, percent, _ = errors(va12, drive, kit, range(25))
+        z, percent = errors(va12, drive, kit, range(25))
         assert np.median(np.sqrt(np.mean(percent**2, axis=0))) < middle
         told.append(z)
     z = np.concatenate(told)
@@ -343,9 +317,7 @@ def undisturbed(va12: Model) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("nature", "amount"), [(sloping, 0.0005), (sloping, 0.002), (worn, 0.001)], ids=["slight", "slope", "wheel"]
-)
+@pytest.mark.parametrize(("nature", "amount"), [(sloping, 0.002), (worn, 0.001)], ids=["slope", "wheel"])
 def test_what_nobody_would_notice_on_site_is_within_the_intervals(
     va12: Model, undisturbed: np.ndarray, nature: Callable[[Model, float], Model], amount: float
 ) -> None:
@@ -505,13 +477,12 @@ def test_readings_that_tell_nothing_of_a_parameter_are_no_estimate(straight: Mod
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["R60", "R60_accuracy"])
-def test_a_design_that_is_played_back_has_intervals_that_hold(va12: Model, name: str) -> None:
+def test_a_design_that_is_played_back_has_intervals_that_hold(va12: Model) -> None:
     """The same motion in every run, so that encoders' errors are its own and don't average out over drives.
 
     Intervals are those of noise, as the machine is its file's.
     """
-    motion = simulate(va12, design(name))
+    motion = simulate(va12, design("R60_accuracy"))
     inside = []
     for seed in range(25):
         estimate = joint(va12, [measured(va12, motion, va12.nominal, seed=60000 + seed)], va12.machine.filter)

@@ -37,19 +37,10 @@ from excite.trajectories import (
     place_on_lane,
     scale_torques,
 )
-from excite.trajectories.continuation import STAGES, repair, run_stages, start_from_multisine, widen_transitions
+from excite.trajectories.collocation import widen_transitions
+from excite.trajectories.continuation import STAGES, repair, run_stages, start_from_multisine
 from excite.trajectories.excitation import chirp, steps
 from excite.trajectories.limits import count_reversals, travel_directions
-
-
-@pytest.fixture(scope="module")
-def straight() -> Model:
-    return prediction.build(machine.load_machine("va12_straight"))
-
-
-@pytest.fixture(scope="module")
-def roller() -> Model:
-    return prediction.build(machine.load_machine("va12"))
 
 
 def shorter(model: Model, seconds: float, **other: object) -> Problem:
@@ -135,7 +126,7 @@ def test_same_seed_same_design(straight: Model, quick: Design) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_s40_reaches_the_target_from_every_start(straight: Model, seed: int) -> None:
     problem = straight.machine.problems["S40"]
     d = design(straight, problem, starts=1, seed=seed)
@@ -146,12 +137,12 @@ def test_s40_reaches_the_target_from_every_start(straight: Model, seed: int) -> 
 
 
 @pytest.mark.slow
-def test_r60_reaches_the_target(roller: Model) -> None:
-    problem = roller.machine.problems["R60"]
-    d = design(roller, problem, starts=2, seed=0)
+def test_r60_reaches_the_target(va12: Model) -> None:
+    problem = va12.machine.problems["R60"]
+    d = design(va12, problem, starts=1, seed=0)
     assert d.cond_phi <= 19.0
     assert d.max_violation <= TOLERANCE
-    fresh_check(roller, problem, d)
+    fresh_check(va12, problem, d)
 
 
 def test_another_machine_needs_no_other_code() -> None:
@@ -256,8 +247,8 @@ def test_ctrl_c_keeps_the_best_so_far() -> None:
     assert run.stdout.split() == ["False", "True", "True"], run.stderr[-2000:]
 
 
-def test_limits_are_named_and_scaled(roller: Model) -> None:
-    every = machine_limits(roller, roller.machine.problems["R60"])
+def test_limits_are_named_and_scaled(va12: Model) -> None:
+    every = machine_limits(va12, va12.machine.problems["R60"])
     names = [g.name for g in every]
     assert len(set(names)) == len(names) == 19
     assert {"torque u2", "torque rate u4", "position articulation", "rate articulation", "power"} <= set(names)
@@ -274,22 +265,22 @@ def test_check_measures_the_excess(straight: Model) -> None:
     assert excess["rest x0'"] > 1
 
 
-def test_placed_fits_a_diagonal_path_into_the_lane(roller: Model) -> None:
-    problem = roller.machine.problems["R60"]
+def test_placed_fits_a_diagonal_path_into_the_lane(va12: Model) -> None:
+    problem = va12.machine.problems["R60"]
     u = np.zeros((1501, 3))
     u[20:900, [0, 2]] = 600.0
     q0 = np.array([30.0, -12.0, 0.8, 0, 0, 0])
-    motion = simulate(roller, u, q0=q0)
-    assert max(v for k, v in check_limits(roller, problem, motion).items() if k.startswith("lane")) > 0.1
-    again = simulate(roller, u, q0=place_on_lane(roller, problem, motion))
-    assert max(v for k, v in check_limits(roller, problem, again).items() if k.startswith("lane")) == 0
+    motion = simulate(va12, u, q0=q0)
+    assert max(v for k, v in check_limits(va12, problem, motion).items() if k.startswith("lane")) > 0.1
+    again = simulate(va12, u, q0=place_on_lane(va12, problem, motion))
+    assert max(v for k, v in check_limits(va12, problem, again).items() if k.startswith("lane")) == 0
 
 
 @pytest.mark.parametrize("make", [multisine, steps, chirp])
-def test_baselines_keep_torque_and_rate(roller: Model, make: Callable[[Model, Problem, int], Manoeuvre]) -> None:
-    problem = roller.machine.problems["R60"]
-    drive = make(roller, problem, 5)
-    assert np.array_equal(drive.torque, make(roller, problem, 5).torque)
+def test_baselines_keep_torque_and_rate(va12: Model, make: Callable[[Model, Problem, int], Manoeuvre]) -> None:
+    problem = va12.machine.problems["R60"]
+    drive = make(va12, problem, 5)
+    assert np.array_equal(drive.torque, make(va12, problem, 5).torque)
     assert (np.abs(drive.torque).max(axis=0) <= [5000, 15000, 5000]).all()
     rate = np.abs(np.diff(drive.torque, axis=0)).max(axis=0) / 0.2
     assert (rate <= np.array([10000, 40000, 10000]) * (1 + 1e-12)).all()
@@ -341,12 +332,12 @@ def test_newton_step_is_the_dense_one() -> None:
     assert seen == {True, False}
 
 
-def test_settled_states_follow_the_accurate_simulation(roller: Model) -> None:
-    problem = shorter(roller, 6.0)
-    drive = multisine(roller, problem, 2)
-    motion = simulate(roller, drive.torque[:1] * 0 + drive.sample(100) * 0.3)
-    sizes = dict.fromkeys(roller.coordinates, 1.0) | {c + "'": 1.0 for c in roller.coordinates}
-    tr = collocation.transcribe(roller, problem, sizes, 30, motion, elements=4)
+def test_settled_states_follow_the_accurate_simulation(va12: Model) -> None:
+    problem = shorter(va12, 6.0)
+    drive = multisine(va12, problem, 2)
+    motion = simulate(va12, drive.torque[:1] * 0 + drive.sample(100) * 0.3)
+    sizes = dict.fromkeys(va12.coordinates, 1.0) | {c + "'": 1.0 for c in va12.coordinates}
+    tr = collocation.transcribe(va12, problem, sizes, 30, motion, elements=4)
     at = (np.arange(30)[:, None] + tr.node_position) * tr.interval_s
     start, U = np.zeros(tr.n_z), 0.3 * drive.torque / tr.torque_scale
     Z = collocation.solve_states(tr, start, U, np.zeros((30, 12, tr.n_z)))
@@ -356,16 +347,16 @@ def test_settled_states_follow_the_accurate_simulation(roller: Model) -> None:
     assert np.abs(collocation.solve_states(tr, start, U, far) - Z).max() < 1e-7
     for k, name in enumerate(tr.state_names):
         if name.endswith("'"):
-            true = motion.nu[:, roller.coordinates.index(name[:-1])]
+            true = motion.nu[:, va12.coordinates.index(name[:-1])]
             assert np.abs(Z[:, -1, k] - np.interp(at[:, -1], motion.t, true)).max() < 2e-3
 
 
-def test_softening_changes_nothing_but_standstill(roller: Model) -> None:
-    softer = widen_transitions(roller, 10, 3)
-    assert np.array_equal(softer.nominal, roller.nominal)
+def test_softening_changes_nothing_but_standstill(va12: Model) -> None:
+    softer = widen_transitions(va12, 10, 3)
+    assert np.array_equal(softer.nominal, va12.nominal)
     q, u = np.zeros(6), np.array([500.0, 2000.0, 300.0])
     nu = np.array([1.0, 0.0, 0.0, 1.55, 0.3, 1.55])
-    fast = [m.acceleration(q, nu, u, m.nominal).full() for m in (roller, softer)]
+    fast = [m.acceleration(q, nu, u, m.nominal).full() for m in (va12, softer)]
     assert np.abs(fast[0] - fast[1]).max() < 0.05 * np.abs(fast[0]).max()
 
 
@@ -400,14 +391,14 @@ def test_a_polygon_is_kept(straight: Model, shape: str) -> None:
     assert any(outside) == (max(excess.values()) > 0)
 
 
-def test_placed_fits_a_path_into_a_polygon(roller: Model) -> None:
-    problem = roller.machine.problems["R60"].model_copy(update={"lane_polygon_m": ((-9, -9), (20, -9), (-9, 9))})
+def test_placed_fits_a_path_into_a_polygon(va12: Model) -> None:
+    problem = va12.machine.problems["R60"].model_copy(update={"lane_polygon_m": ((-9, -9), (20, -9), (-9, 9))})
     u = np.zeros((1501, 3))
     u[20:900, [0, 2]] = 450.0
-    motion = simulate(roller, u, q0=np.array([5.0, 5.0, 2.0, 0, 0, 0]))
-    assert max(v for k, v in check_limits(roller, problem, motion).items() if k.startswith("lane")) > 0.1
-    again = simulate(roller, u, q0=place_on_lane(roller, problem, motion))
-    assert max(v for k, v in check_limits(roller, problem, again).items() if k.startswith("lane")) == 0
+    motion = simulate(va12, u, q0=np.array([5.0, 5.0, 2.0, 0, 0, 0]))
+    assert max(v for k, v in check_limits(va12, problem, motion).items() if k.startswith("lane")) > 0.1
+    again = simulate(va12, u, q0=place_on_lane(va12, problem, motion))
+    assert max(v for k, v in check_limits(va12, problem, again).items() if k.startswith("lane")) == 0
 
 
 def test_directions_fit_a_motion_best(straight: Model) -> None:
@@ -448,14 +439,14 @@ def test_few_reversals_are_kept(straight: Model, most: int) -> None:
 
 
 @pytest.mark.slow
-def test_r60_within_a_triangle_and_with_two_reversals(roller: Model) -> None:
+def test_r60_within_a_triangle_and_with_two_reversals(va12: Model) -> None:
     corners = ((-18.0, -9.0), (18.0, -9.0), (0.0, 14.0))
-    problem = roller.machine.problems["R60"].model_copy(update={"lane_polygon_m": corners, "reversals": 2})
-    d = design(roller, problem, starts=2, seed=0)
+    problem = va12.machine.problems["R60"].model_copy(update={"lane_polygon_m": corners, "reversals": 2})
+    d = design(va12, problem, starts=2, seed=0)
     assert d.max_violation <= TOLERANCE
     assert count_reversals(d.motion) <= 2
-    places = roller.kinematics(d.motion.q.T, d.motion.nu.T)[3].full().reshape(3, len(d.motion.t), -1)
-    bodies = [b.index for b in roller.machine.body]
+    places = va12.kinematics(d.motion.q.T, d.motion.nu.T)[3].full().reshape(3, len(d.motion.t), -1)
+    bodies = [b.index for b in va12.machine.body]
     area = MplPath(np.array(corners))
     for i in (0, 4):
         assert area.contains_points(places[:2, :, bodies.index(i)].T, radius=0.05).all()
