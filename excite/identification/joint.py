@@ -25,7 +25,6 @@ from excite.simulation import outside_law
 from excite.smoothing import (
     ACCEPTABLE_STEP,
     MAX_IDENTIFIABLE_STD,
-    PROCESS_NOISE_LEVELS,
     Fit,
     Measurements,
     Missing,
@@ -101,18 +100,11 @@ def joint_exactly(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate
 def joint_beside_forces(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     """Estimate beside forces that the model lacks (`excite.smoothing.fit_unknown_forces`); a note tells their size.
 
-    If that fit does not settle, process noise is tried; if no level converges, the fit that did not settle is returned,
-    its next step in the doubt. The estimate is doubtful. Raises NotConvergedError.
+    The estimate is doubtful; the next step of a fit that does not settle is in the doubt. Raises NotConvergedError.
     """
     space, measurements, starts, held = _prepare(model, logs, filter)
     notes = describe_noise(space, measurements)
     around = fit_unknown_forces(space, measurements, starts, held)
-    if around.fit.step > ACCEPTABLE_STEP:  # a straight drive tells a mass from unknown forces poorly
-        weighted = [replace(data, unbiased=False) for data in measurements]
-        for level in PROCESS_NOISE_LEVELS:
-            noisy = fit_logs(space, weighted, starts, model.nominal, starts, held, level)
-            if noisy.status == "converged":
-                return replace(_build_estimate(space, weighted, noisy, filter, notes), doubt=UNEXPLAINED_DOUBT)
     found = around.fit if around.fit.linear else around.fit.required()
     missing = describe_missing(space, found.unknown, found.trajectories)
     if missing:
