@@ -91,6 +91,8 @@ def fit_unknown_forces(
             ratio[n_u:] < 1, np.maximum(ratio[n_u:], 0.1), np.sqrt(np.minimum(ratio[n_u:], 100.0))
         )
         white[forced] = np.maximum(white, least)[forced]
+        # Memory: what recovers states is no longer needed.
+        fit = replace(fit, linear=tuple(replace(log, chain=log.chain.without_levels) for log in fit.linear))
     assert fit is not None
     spread = clustered_inflation(fit, float(model.machine.sampling_hz)) if fit.linear else np.ones(len(fit.X))
     return FitBeside(replace(fit, covariance=fit.covariance * np.outer(spread, spread)), logs)
