@@ -59,7 +59,10 @@ def estimate_in_full(
             if wide is None:
                 if not isinstance(failed, UnexplainedError):
                     raise
-                estimate = find(model, logs, filter)
+                if small and narrowed:
+                    wide = find(with_tolerances(model, narrowed), logs, filter)
+                else:
+                    estimate = find(model, logs, filter)
     if wide is not None:
         estimate, errors = budget.split(wide, n, narrowed)
         X[: len(wide.value)] = wide.value_or(X[: len(wide.value)])

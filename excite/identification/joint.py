@@ -17,7 +17,7 @@ from excite.errors import NotIdentifiableError
 from excite.identification import identifiability
 from excite.identification.combinations import describe_combinations
 from excite.identification.estimate import NOTHING_MOVES_MESSAGE, Discrepancy, Estimate, held_note
-from excite.identification.near_rest import friction_near_rest, sticking
+from excite.identification.near_rest import friction_near_rest
 from excite.logs import Log, decimate, derivative
 from excite.model import Model
 from excite.model.machine import Filter
@@ -25,7 +25,6 @@ from excite.simulation import outside_law
 from excite.smoothing import (
     ACCEPTABLE_STEP,
     MAX_IDENTIFIABLE_STD,
-    PROCESS_NOISE_LEVELS,
     Fit,
     Measurements,
     Missing,
@@ -82,15 +81,13 @@ def joint_exactly(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate
     """Estimate by joint smoothing if the model alone explains the logs.
 
     It does if no sensor's innovations are larger than noise and the marginal likelihood says that no force is lacking.
-    If not, friction may stick (see `_fit_sticking`). Raises UnexplainedError if neither explains the logs.
+    Raises UnexplainedError if not.
     """
     space, measurements, starts, held = _prepare(model, logs, filter)
     readings = sum(float(data.used.sum()) for data in measurements)
     limit = Settings(cost_limit=LOST_COST_RATIO * readings)
     fit = fit_logs(space, measurements, starts, model.nominal, starts, held, settings=limit)
     close = fit.step <= CLOSE_STEP and not find_suspect_sensors(space, logs, fit)
-    if (not close or shows_sticking(model, logs, filter, fit)) and (stuck := _fit_sticking(model, logs, filter, held)):
-        return stuck
     if not close or lacks_forces(space, measurements, starts, held, fit):
         raise UnexplainedError("the model alone does not explain the log")
     fit, one_sided, flat_notes = quantify_uncertainty(space, measurements, starts, fit)
@@ -101,18 +98,11 @@ def joint_exactly(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate
 def joint_beside_forces(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     """Estimate beside forces that the model lacks (`excite.smoothing.fit_unknown_forces`); a note tells their size.
 
-    If that fit does not settle, process noise is tried; if no level converges, the fit that did not settle is returned,
-    its next step in the doubt. The estimate is doubtful. Raises NotConvergedError.
+    The estimate is doubtful; the next step of a fit that does not settle is in the doubt. Raises NotConvergedError.
     """
     space, measurements, starts, held = _prepare(model, logs, filter)
     notes = describe_noise(space, measurements)
     around = fit_unknown_forces(space, measurements, starts, held)
-    if around.fit.step > ACCEPTABLE_STEP:  # a straight drive tells a mass from unknown forces poorly
-        weighted = [replace(data, unbiased=False) for data in measurements]
-        for level in PROCESS_NOISE_LEVELS:
-            noisy = fit_logs(space, weighted, starts, model.nominal, starts, held, level)
-            if noisy.status == "converged":
-                return replace(_build_estimate(space, weighted, noisy, filter, notes), doubt=UNEXPLAINED_DOUBT)
     found = around.fit if around.fit.linear else around.fit.required()
     missing = describe_missing(space, found.unknown, found.trajectories)
     if missing:
@@ -151,27 +141,6 @@ def shows_sticking(model: Model, logs: Sequence[Log], filter: Filter, fit: Fit) 
     if min(len(near), len(moving)) < MIN_STICKING_SAMPLES:
         return False
     return float(np.mean(near)) > STICKING_RATIO * float(np.mean(moving))
-
-
-def _fit_sticking(model: Model, logs: Sequence[Log], filter: Filter, held: np.ndarray) -> Estimate | None:
-    """Fit with friction of either sign near rest; None if the logs have no rest or are not explained by it."""
-    rests = sticking(model, logs, filter)
-    if rests is None:
-        return None
-    soft, extra = rests
-    space = build_state_space(soft, common_sensors(soft, logs))
-    measurements, starts = prepare_logs(space, logs, filter, unbiased=True, extra_torque_noise=extra)
-    fit = fit_logs(space, measurements, starts, model.nominal, starts, held)
-    if fit.step > CLOSE_STEP or find_suspect_sensors(space, logs, fit):
-        return None
-    fit, one_sided, flat_notes = quantify_uncertainty(space, measurements, starts, fit)
-    share = float(np.mean([np.mean(x > 0) for x in extra]))
-    note = (
-        f"friction sticks in this log: in the {format_number(100 * share, 2)} % of it in which a joint is near rest,"
-        " the friction may have any value up to Fs"
-    )
-    notes = (*describe_noise(space, measurements), *flat_notes, note)
-    return _build_estimate(space, measurements, fit, filter, notes, one_sided)
 
 
 def _build_estimate(

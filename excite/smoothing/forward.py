@@ -283,13 +283,13 @@ DETERMINANT_STEP = 1e-3  # of a parameter over its scale, for the difference quo
 DETERMINANT_TRANSITIONS = 1500  # of a log, of which difference quotients are taken: neighbours change alike
 
 
-def log_variance_slope(
+def log_variance_slopes(
     space: StateSpace, at: Evaluation, linear: LinearisedLog, X: np.ndarray, free: np.ndarray
-) -> np.ndarray:
-    """Return the slope of `innovations.log_variance` by the scaled parameters (n_base,), zero where not free (n_base,).
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the slopes of `innovations.log_variance` by scaled parameters (n_base,) and coefficients (count,).
 
-    The covariance P' = A P A' + B Q B' that a transition predicts, P from all readings before, changes the determinant
-    by the trace of N dP', where N is the covariance of the multiplier after it.
+    Zero where a parameter is not free (n_base,). The covariance P' = A P A' + B Q B' that a transition predicts, P from
+    all readings before, changes the determinant by the trace of N dP', N the covariance of the multiplier after it.
     """
     scale, K = state_scale(space), len(at.defect)
     places = np.arange(0, K, max(1, K // DETERMINANT_TRANSITIONS))
@@ -306,21 +306,40 @@ def log_variance_slope(
         delivered = space.delivered_torques(at.data.torque, X, at.trajectory.torque_error)[0]
         left, right = _driving_inputs(space, at.trajectory, delivered, at.error, at.lacking, at.features)
         steps = integrate(space, state, left[places], right[places], X)
-        return differentiate(space, steps, X, False, feedback is not None)
+        return differentiate(space, steps, X, False, at.lacking.count > 0)
 
-    def value(X: np.ndarray) -> float:
-        by = transitions(X)
+    def closed(by: TransitionJacobians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         A, inverse = close(space, by, feedback)
-        A, B = (A, by.B) if inverse is None else (inverse @ A, inverse @ by.B)
-        return float(np.sum(by_A * A) + np.sum(by_B * B[:, :, linear.acting]))
+        inverse = np.broadcast_to(np.eye(space.n), A.shape) if inverse is None else inverse
+        return inverse @ A, inverse @ by.B[:, :, linear.acting], inverse
 
-    feedback = without_growth(space, transitions(X), feedback)
-    here, found = value(X), np.zeros(len(X))
+    def value(by: TransitionJacobians) -> float:
+        A, B, _ = closed(by)
+        return float(np.sum(by_A * A) + np.sum(by_B * B))
+
+    by = transitions(X)
+    feedback = without_growth(space, by, feedback)
+    here, found = value(by), np.zeros(len(X))
     for k in np.flatnonzero(free):
         moved = X.copy()
         moved[k] += DETERMINANT_STEP * space.model.scale[k]
-        found[k] = (value(moved) - here) / DETERMINANT_STEP
-    return found
+        found[k] = (value(transitions(moved)) - here) / DETERMINANT_STEP
+    if not at.lacking.count:
+        return found, np.zeros(0)
+    A, B, inverse = closed(by)
+    back = inverse.transpose(0, 2, 1)
+    behind = back @ (by_A @ A.transpose(0, 2, 1) + by_B @ B.transpose(0, 2, 1))
+    ends = (
+        ((by.B - by.rising).transpose(0, 2, 1) @ back @ by_A, places),
+        (by.rising.transpose(0, 2, 1) @ behind, places + 1),
+    )
+    coefficients = np.zeros(at.lacking.count)
+    for by_input, own in ends:
+        weights = np.zeros((len(own), space.n_inputs, at.features.shape[1]))
+        slopes = space.features(at.trajectory.state[own])[1]
+        weights[:, space.input_columns] = by_input[:, :, : space.core] @ slopes.transpose(0, 2, 1)
+        coefficients += at.lacking.along_slopes(weights, at.features[own])
+    return found, coefficients
 
 
 @dataclass(frozen=True)

@@ -287,13 +287,15 @@ def with_designs(state: State, settings: InverseSettings, admit: bool, moving: b
 def moved_channels(state: State) -> State:
     """Move the torques of channels that are late or early by more than a row, by whole rows.
 
-    The column of the alignment is linear in the time, which holds for a share of a row.
+    The column of the alignment is linear in the time, which holds for a share of a row: a shift found from further off
+    overshoots up to twofold, and would come back the same way, so half of it counts.
     """
-    chains = []
+    chains, shift = [], state.point.shift.copy()
     for chain in state.problem.chains:
         sample = float(chain.t[1] - chain.t[0])
         off = state.point.shift / sample - chain.moved
-        rows = np.where(np.abs(off) > MOST_OFF, np.round(off), 0).astype(int)
+        rows = np.where(np.abs(off) > MOST_OFF, np.sign(off) * np.ceil(np.abs(off) / 2), 0).astype(int)
+        shift = np.clip(shift, (chain.moved + rows - MOST_OFF) * sample, (chain.moved + rows + MOST_OFF) * sample)
         if not rows.any():
             chains.append(chain)
             continue
@@ -304,7 +306,8 @@ def moved_channels(state: State) -> State:
             lost = slice(-rows[j], None) if rows[j] > 0 else slice(0, -rows[j])
             used[lost, j] = 0
         chains.append(replace(chain, torque=torque, used=used, moved=chain.moved + rows))
-    return replace(state, problem=replace(state.problem, chains=tuple(chains)))
+    problem, point = replace(state.problem, chains=tuple(chains)), replace(state.point, shift=shift)
+    return replace(state, problem=problem, point=point)
 
 
 MOST_OFF = 0.75  # of a row, until which a channel stays: at half a row it would go to and fro; chosen

@@ -124,18 +124,21 @@ def prior_terms(model: Model, prior: np.ndarray, X: np.ndarray) -> tuple[np.ndar
 
 @dataclass(frozen=True)
 class Determinant:
-    """Log determinant of the innovations' covariance as a function of the parameters.
+    """Log determinant of the innovations' covariance as a function of parameters and coefficients.
 
-    slope (n_base,): by the scaled parameters, at X (n_base,). White forces move an inertia or a stiff contact the less
-    the larger it is, so where the determinant falls with a parameter's size it is a multiple of its logarithm.
+    slope (n_base,): by the scaled parameters, at X (n_base,). by_coefficients (count,), at coefficients (count,).
+    White forces move an inertia or a stiff contact the less the larger it is, so where the determinant falls with a
+    parameter's size it is a multiple of its logarithm.
     """
 
     slope: np.ndarray
     X: np.ndarray
+    by_coefficients: np.ndarray
+    coefficients: np.ndarray
 
     def terms(self, X: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """Return information (n_base,), slope (n_base,) and cost at X (n_base,), of steps over the scale."""
-        as_log = self.slope * self.X < 0
+        as_log = self.slope * self.X < -scale  # else a change by its size changes nothing
         if (X[as_log] * self.X[as_log] <= 0).any():
             return np.zeros_like(X), np.zeros_like(X), np.inf
         ratio = np.where(as_log, self.X / np.where(as_log, X, 1.0), 1.0)
@@ -147,14 +150,17 @@ class Determinant:
 def log_determinant(
     space: StateSpace, measurements: Sequence[Measurements], starts: Sequence[Trajectory], fit: Fit
 ) -> Determinant:
-    """Return the log determinant of all innovations' covariance about a fit, its coefficients held."""
-    slope = np.zeros(len(fit.X))
-    logs = zip(measurements, fit.trajectories, starts, fit.unknown.lacking, fit.linear, strict=True)
-    for data, trajectory, start, lacking, linear in logs:
+    """Return the log determinant of all innovations' covariance about a fit."""
+    slope, by_coefficients = np.zeros(len(fit.X)), np.zeros(fit.unknown.count)
+    unknown = fit.unknown
+    logs = zip(measurements, fit.trajectories, starts, unknown.lacking, unknown.index, fit.linear, strict=True)
+    for data, trajectory, start, lacking, index, linear in logs:
         at = forward.evaluate(space, data, trajectory, start.state[0], fit.X, lacking)
         assert at is not None  # the fit ended there
-        slope += forward.log_variance_slope(space, at, linear, fit.X, ~fit.unidentifiable)
-    return Determinant(slope, fit.X)
+        own, by_own = forward.log_variance_slopes(space, at, linear, fit.X, ~fit.unidentifiable)
+        slope += own
+        by_coefficients[index] += by_own
+    return Determinant(slope, fit.X, by_coefficients, unknown.coefficients(fit.trajectories))
 
 
 @dataclass(frozen=True)
@@ -232,6 +238,9 @@ class LogProblem:
         where = np.arange(n_p, n_p + n_c)
         information[where, where], slope[where] = precision, precision * coefficients
         cost += float(precision @ coefficients**2)
+        if self.pull is not None:
+            slope[where] += self.pull.by_coefficients / 2
+            cost += float(self.pull.by_coefficients @ (coefficients - self.pull.coefficients))
         for data, trajectory, own in zip(self.measurements, self.point.trajectories, self.indices, strict=True):
             offsets = own[len(own) - len(data.offset_sensors) :]
             deviation = trajectory.offset / offset_scale(self.space, data) - 0.5

@@ -22,20 +22,23 @@ from excite.smoothing.unknown_forces import UnknownForces, catalogue
 
 SIZE_SCATTER = 1.0  # standard deviation of the logarithm of a size about the common level: a factor of e
 CLEAN_LIKELIHOOD_RATIO = 8.0  # twice the log-likelihood that the common level must gain: one false alarm in 400 logs
-LEVELS = np.linspace(-7.0, 2.5, 20)  # logarithms of the common level that are tried
+LEVELS = np.linspace(-7.0, 1.0, 17)  # logarithms of the common level that are tried; sizes stay within them
+STARTS = (-4.0, -2.0, 0.0)  # of the logarithms of all sizes
 PASSES = 60  # of the fixed point
-
+SETTLED = 0.02  # step of all logarithms that ends it
 
 FIRST_FORCE_STD = 300.0  # [N, N m] of white forces in the first round, larger than what most logs need
 SLOWEST_SHRINKING = 0.4  # of a size from round to round, as shapes along a trajectory that still moves mislead
 FIRST_DAMPING = 1e4  # information of a parameter known to 1 % of its scale: sizes come first, then the parameters
 FORCES = ("lengthwise", "lateral", "turning")  # of a contact that are white, too
-# Rounds: sizes and shapes are renewed after each. Largest step that ends a round [standard deviations], and damping.
+# Rounds: sizes and shapes are renewed after each. Sizes settle while parameters hardly move, else these take the place
+# of what a size that is still too small leaves out. Largest step that ends a round [standard deviations], and damping.
+SETTLING_ROUNDS = (Settings(3, FIRST_DAMPING, 1.0, tolerance=0.3),) * 5
 ROUNDS = (
-    Settings(6, FIRST_DAMPING, 1.0, tolerance=0.3),
+    *SETTLING_ROUNDS,
     Settings(12, tolerance=0.2),
-    Settings(12, 0.25, tolerance=0.1),
-    Settings(12, 0.25, tolerance=0.05),
+    Settings(8, 0.25, tolerance=0.1),
+    Settings(8, 0.25, tolerance=0.05),
 )
 
 
@@ -63,10 +66,11 @@ def fit_unknown_forces(
     """
     model, n_u = space.model, len(space.model.inputs)
     white = np.array([FIRST_FORCE_STD * (kind in FORCES) for _, kind in space.forces])
+    least = _least_force_std(space, measurements)
     X, trajectories = (model.nominal, tuple(starts)) if first is None else (first[0], tuple(first[1]))
     size, inflation, logs, pull = None, np.ones(n_u), tuple(measurements), None
     fit: Fit | None = None
-    for settings in rounds:
+    for k, settings in enumerate(rounds):
         unknown = catalogue(space, list(zip(logs, trajectories, strict=True)), X, white, True if named else None)
         if size is None:
             trajectories = _without_coefficients(trajectories, unknown)
@@ -78,9 +82,9 @@ def fit_unknown_forces(
         fit = latest if fit is None or not lost else fit
         if lost:
             break
-        if settings is not rounds[-1]:
+        if k + 1 >= len(SETTLING_ROUNDS) and settings is not rounds[-1]:
             pull = log_determinant(space, logs, starts, fit)
-        X, trajectories, found = fit.X, fit.trajectories, find_sizes(fit)[0].size
+        X, trajectories, found = fit.X, fit.trajectories, find_sizes(fit).size
         size = np.maximum(found, SLOWEST_SHRINKING * unknown.size)
         ratio = white_noise_ratios(fit)
         inflation = np.maximum(inflation * ratio[:n_u], 1.0)
@@ -93,9 +97,25 @@ def fit_unknown_forces(
         white[forced] *= np.where(
             ratio[n_u:] < 1, np.maximum(ratio[n_u:], 0.1), np.sqrt(np.minimum(ratio[n_u:], 100.0))
         )
+        white[forced] = np.maximum(white, least)[forced]
+        # Memory: what recovers states is no longer needed.
+        fit = replace(fit, linear=tuple(replace(log, chain=log.chain.without_levels) for log in fit.linear))
     assert fit is not None
     spread = clustered_inflation(fit, float(model.machine.sampling_hz)) if fit.linear else np.ones(len(fit.X))
     return FitBeside(replace(fit, covariance=fit.covariance * np.outer(spread, spread)), logs)
+
+
+def _least_force_std(space: StateSpace, measurements: Sequence[Measurements]) -> np.ndarray:
+    """Return the least standard deviation (n_forces,) of white forces: that of a driven contact's torque noise.
+
+    Smaller ones would hardly narrow any interval, and leave no room for what no shape follows.
+    """
+    noise = np.max([data.noise.torque for data in measurements], axis=0)
+    contacts = {b.index: b.contact for b in space.model.machine.contacts if b.contact is not None}
+    drives = zip(space.model.machine.actuated, noise, strict=True)
+    force = min((x / float(b.contact.radius) for b, x in drives if b.contact is not None), default=0.0)
+    half_width = {k: float(c.width) / 2 for k, c in contacts.items() if c.width is not None}
+    return np.array([force * (half_width.get(k, 0.0) if kind == "turning" else 1.0) for k, kind in space.forces])
 
 
 CLUSTER_S = 2.0  # [s] of a log whose errors may belong together: a manoeuvre
@@ -130,7 +150,10 @@ def lacks_forces(
     unknown = catalogue(space, list(zip(measurements, exact.trajectories, strict=True)), exact.X, none)
     along = _without_coefficients(exact.trajectories, unknown)
     fit = linearise_with(space, measurements, along, exact.X, starts, held | exact.unidentifiable, unknown)
-    return fit is not None and find_sizes(fit)[1] >= CLEAN_LIKELIHOOD_RATIO
+    if fit is None:
+        return False
+    own, groups = _integrate_out_parameters(fit), len(unknown.groups)
+    return max(own.posterior(np.full(groups, level))[2] for level in LEVELS) >= CLEAN_LIKELIHOOD_RATIO
 
 
 def _without_coefficients(trajectories: Sequence[Trajectory], unknown: UnknownForces) -> tuple[Trajectory, ...]:
@@ -157,25 +180,26 @@ class _Coefficients:
         return mean, vectors**2 @ (1 / total), float(np.sum(pull**2 / total) - np.log(total).sum())
 
 
-def find_sizes(fit: Fit) -> tuple[UnknownForces, float]:
-    """Return what a fit lacks with its most likely sizes, and twice the log-likelihood that they gain.
-
-    All sizes are zero if a common level gains less than CLEAN_LIKELIHOOD_RATIO.
-    """
-    unknown = fit.unknown
-    own = _integrate_out_parameters(fit)
-    gains = [own.posterior(np.full(len(unknown.groups), level))[2] for level in LEVELS]
-    if max(gains) < CLEAN_LIKELIHOOD_RATIO:
-        return replace(unknown, size=np.zeros(len(unknown.groups))), max(gains)
-    level = float(LEVELS[int(np.argmax(gains))])
-    logs, count = np.full(len(unknown.groups), level), np.bincount(own.group)
-    for _ in range(PASSES):
-        mean, variance, _ = own.posterior(logs)
-        square = np.bincount(own.group, mean**2)
-        determined = count - np.bincount(own.group, variance)
-        slope = square - determined - 2 * (logs - level) / SIZE_SCATTER**2
-        logs = logs + np.clip(slope / (2 * determined + square + 2 / SIZE_SCATTER**2), -0.7, 0.7)
-    return replace(unknown, size=np.exp(logs)), own.posterior(logs)[2]
+def find_sizes(fit: Fit) -> UnknownForces:
+    """Return what a fit lacks with its most likely sizes and common level, from the best of several starts."""
+    unknown, own = fit.unknown, _integrate_out_parameters(fit)
+    count = np.bincount(own.group)
+    best, most = np.zeros(len(count)), -np.inf
+    for start in STARTS:
+        logs = np.full(len(count), start)
+        for _ in range(PASSES):
+            mean, variance, _ = own.posterior(logs)
+            square = np.bincount(own.group, mean**2)
+            determined = count - np.bincount(own.group, variance)
+            slope = square - determined - 2 * (logs - logs.mean()) / SIZE_SCATTER**2
+            step = np.clip(slope / (2 * determined + square + 2 / SIZE_SCATTER**2), -0.7, 0.7)
+            before, logs = logs, np.clip(logs + step, LEVELS[0], LEVELS[-1])
+            if np.abs(logs - before).max() < SETTLED:
+                break
+        likelihood = own.posterior(logs)[2] - float(np.sum((logs - logs.mean()) ** 2)) / SIZE_SCATTER**2
+        if likelihood > most:
+            best, most = logs, likelihood
+    return replace(unknown, size=np.exp(best))
 
 
 def _integrate_out_parameters(fit: Fit) -> _Coefficients:

@@ -8,8 +8,8 @@ standard deviation, its size, found by marginal likelihood (MacKay, "Bayesian in
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -74,16 +74,29 @@ class Lacking:
 
     def feedback(self, coefficients: np.ndarray, features: np.ndarray, n_in: int) -> np.ndarray | None:
         """Return the slopes (N, n_in, n_features) of the inputs by the features, None if there are none."""
-        own = replace(self, inputs=tuple(t for t in self.inputs if t.form is not None))
-        if not own.inputs or not coefficients.any():
+        if not any(t.form for t in self.inputs) or not coefficients.any():
             return None
         slopes = np.zeros((len(features), n_in, features.shape[1]))
-        for k in range(features.shape[1]):
-            step = np.zeros(features.shape[1])
-            step[k] = FEATURE_STEP * max(float(np.abs(features[:, k]).max()), 1e-9)
-            ahead, behind = (own.added_inputs(coefficients, features + sign * step, n_in) for sign in (1, -1))
-            slopes[:, :, k] = (ahead - behind) / (2 * step[k])
+        for term, feature, by in self._slopes(features):
+            slopes[:, term.at, feature] += by @ coefficients[term.columns]
         return slopes
+
+    def along_slopes(self, weights: np.ndarray, features: np.ndarray) -> np.ndarray:
+        """Return the sums (count,) of weights (N, n_in, n_features) on the slopes that unit coefficients make."""
+        found = np.zeros(self.count)
+        for term, feature, by in self._slopes(features):
+            found[term.columns] += weights[:, term.at, feature] @ by
+        return found
+
+    def _slopes(self, features: np.ndarray) -> Iterator[tuple[Term, int, np.ndarray]]:
+        """Yield the slopes (N, K) of each term by each feature that it follows."""
+        for term in self.inputs:
+            for k in range(features.shape[1] if term.form else 0):
+                step = np.zeros(features.shape[1])
+                step[k] = FEATURE_STEP * max(float(np.abs(features[:, k]).max()), 1e-9)
+                by = (term.values(features + step) - term.values(features - step)) / (2 * step[k])
+                if by.any():
+                    yield term, k, by
 
 
 FEATURE_STEP = 1e-3  # of a feature's largest value, for its difference quotient
@@ -228,7 +241,7 @@ LARGE_QUANTILE = 0.998  # of a speed or slip, at which its curves end
 FRICTION_KNOTS = np.array([0.0, 0.03, 0.12, 0.35, 1.0])  # of the fast speed; dense where Stribeck friction is
 FRICTION_CORRELATION = 0.8  # of a friction curve between neighbouring knots
 SOIL_KNOTS = np.linspace(0.0, 1.0, 6)  # of the large slip
-SOIL_PERIODS = 2  # slow courses of a soil that changes with time
+SOIL_PERIODS = 2  # slow courses of what changes with time, beside a constant: its mean is not the parameter's value
 
 
 def _entries(
@@ -274,9 +287,8 @@ def _entries(
         half = slow[:, : slow.shape[1] // 2]
         add(f"{where}: torque, slow", unit, 0.005 * large, half, k, half.shape[1], 2 * duration / half.shape[1])
         gentle = smooth_part(u[:, k])
-        warming = np.column_stack(
-            [f * c for f in (w / speeds[body.index], np.tanh(w / smoothing)) for c in slow[:, :SOIL_PERIODS].T]
-        )
+        changing = np.column_stack([np.ones(len(t)), slow[:, :SOIL_PERIODS]])
+        warming = np.column_stack([f * c for f in (w / speeds[body.index], np.tanh(w / smoothing)) for c in changing.T])
         add(f"{where}: friction, slow", unit, 0.02 * large, warming, k, warming.shape[1], 2 * duration / SOIL_PERIODS)
         rise = np.gradient(gentle) * rate
         add(f"{where}: torque late", "s", 0.01, -rise[:, None], k, 1)
@@ -289,8 +301,6 @@ def _entries(
     found += _slope_entries(space, nu, rate)
     for j, sensor in enumerate(space.sensors):
         if sensor.kind == "wheel":
-            travel = (data.reading[:, j] - data.reading[0, j])[:, None]
-            found.append(_Entry(f"{sensor.name}: scale", "-", 1e-3, True, ((j, travel),), 1, True))
             turn = np.column_stack([np.sin(data.reading[:, j]), np.cos(data.reading[:, j]) - 1])
             found.append(_Entry(f"{sensor.name}: once a turn", "rad", 1e-3, True, ((j, turn),), 2, True))
     return found
@@ -331,8 +341,8 @@ def _contact_entries(
         g = features[:, feature[own]]
         curves = partial(soil_curves, along=feature[own], across=feature[other], stiffness=K, knots=knots)
         add(f"{kind} stiffness with slip", "-", 0.1, curves, kind, len(SOIL_KNOTS) - 1)
-        changing = -K * g[:, None] * slow[:, :SOIL_PERIODS]
-        add(f"{kind} stiffness, slow", "-", 0.05, changing, kind, SOIL_PERIODS, 2 * duration / SOIL_PERIODS)
+        changing = -K * g[:, None] * np.column_stack([np.ones(len(g)), slow[:, :SOIL_PERIODS]])
+        add(f"{kind} stiffness, slow", "-", 0.05, changing, kind, changing.shape[1], 2 * duration / SOIL_PERIODS)
         relaxing = K * np.gradient(smooth_part(g)) * rate / speed
         add(f"{kind} force late", "m", 0.02, relaxing[:, None], kind, 1)
         add(f"{kind} force, slow", "N", 50.0, slow, kind, slow.shape[1], 2 * duration / slow.shape[1])

@@ -72,9 +72,11 @@ def test_slopes_of_the_innovations_determinant(name: str) -> None:
     unknown = catalogue(space, [(data, start)], model.nominal, white)
     fit = fit_logs(space, [data], [start], model.nominal, [start], held, settings=Settings(4))
     some = 0.02 * np.random.default_rng(0).standard_normal(unknown.count)
-    along = replace(fit.trajectories[0], lacking=some, force_error=None)
 
-    def linearised(X: np.ndarray, data: Measurements = data) -> tuple[forward.Evaluation, LinearisedLog]:
+    def linearised(
+        X: np.ndarray, data: Measurements = data, more: float | np.ndarray = 0.0
+    ) -> tuple[forward.Evaluation, LinearisedLog]:
+        along = replace(fit.trajectories[0], lacking=some + more, force_error=None)
         at = forward.evaluate(space, data, along, start.state[0], X, unknown.lacking[0])
         assert at is not None
         return at, forward.linearise(space, at, start.state[0], X)
@@ -88,17 +90,20 @@ def test_slopes_of_the_innovations_determinant(name: str) -> None:
 
     at, linear = linearised(fit.X)
     n, n_u = len(fit.X), len(model.inputs)
-    slope = forward.log_variance_slope(space, at, linear, fit.X, ~held)
+    slope, by_coefficients = forward.log_variance_slopes(space, at, linear, fit.X, ~held)
     step, none = 1e-3 * np.diag(model.scale), np.zeros(n_u)
     np.testing.assert_allclose(slope, [change(s, none) / 2e-3 for s in step], rtol=0.01, atol=1e-3)
+    of_soil = np.argsort(-np.abs(by_coefficients))[: 5 * len(model.machine.contacts)]
+    for k in of_soil:
+        more = 1e-2 * np.eye(unknown.count)[k]
+        there = [log_variance(linearised(fit.X, more=sign * more)[1]) for sign in (1, -1)]
+        assert by_coefficients[k] == pytest.approx((there[0] - there[1]) / 2e-2, rel=0.05)
     explained = expected_squares(linear)[:n_u]
     np.testing.assert_allclose(explained, [change(np.zeros(n), s) / 4e-3 for s in 1e-3 * np.eye(n_u)], rtol=1e-3)
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    reason="rounds end stalled, with the mass a third too small and soil curves in its place", strict=False
-)
+@pytest.mark.xfail(reason="the mass is 2.5 % too small, as curves of soil and friction take a part", strict=False)
 def test_hidden_effects_are_told_and_leave_the_mass_right(straight: Model, S40: Motion) -> None:
     texts = ("rolling_resistance@front_roll=150", "ground_slope@machine=0.003", "actuator_lag@front_roll=0.015")
     entries = [placing.parse_effect(text, straight.machine, float(S40.t[-1])) for text in texts]
