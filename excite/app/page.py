@@ -42,6 +42,7 @@ ACTIONS = {
 }
 LINKS = {
     "report.html": "report",
+    "motion.html": "the motion in 3-D",
     "sheet.pdf": "sheet for the driver (PDF)",
     "driver.html": "page for the cab",
     "profile.csv": "profile (CSV)",
