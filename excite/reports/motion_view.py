@@ -33,21 +33,20 @@ def motion_scene(model: Model, motion: Motion) -> dict[str, Any]:
     machine, world = model.machine, model.machine.world
     pieces = trajectories.placed_shapes(model, x)
     shaped = trajectories.has_shapes(machine)
-    ends = ca.Function("ends", [x], [ca.vertcat(*[end for piece in pieces for end in (piece.ends[0], piece.ends[-1])])])
-    places = ends(q.T).full().T.reshape(len(at), len(pieces), 6)
-    radius = [piece.radius for piece in pieces]
+    points = [end for piece in pieces for end in (piece.ends[0], piece.ends[-1])]
+    owners, radius = [piece.owner for piece in pieces], [piece.radius for piece in pieces]
     if not shaped:
-        joints = places[:, :, :3]
-        places = np.concatenate([np.concatenate([0 * joints[:, :1], joints[:, :-1]], axis=1), joints], axis=2)
-        radius = [STICK_SHARE * float(np.abs(joints).max() or 1.0)] * len(pieces)
+        points, owners = _sticks(model, x)
+        radius = [STICK_SHARE * _reach(model)] * len(owners)
+    places = ca.Function("places", [x], [ca.vertcat(*points)], {"cse": True})(q.T).full().T
     tool = ca.Function("tool", [x], [trajectories.tool_point(machine, model.true_coordinates(x, model.nominal))])
     names, gaps = trajectories.clearances(model, motion.q[at])
     return {
         "title": f"{machine.title}: the motion over {motion.t[-1]:g} s",
         "t": _rounded(motion.t[at]),
-        "names": [piece.owner for piece in pieces],
+        "names": owners,
         "radius": _rounded(np.array(radius)),
-        "ends": _rounded(places.reshape(len(at), -1), 4),
+        "ends": _rounded(places, 4),
         "tool": _rounded(tool(q.T).full().T, 4),
         "joints": [b.where for b in machine.body if machine.is_free(b) and b.moves_with is None],
         "q": _rounded(_positions(model, q)),
@@ -58,6 +57,32 @@ def motion_scene(model: Model, motion: Motion) -> dict[str, Any]:
         "boxes": [{"name": box.name, "low": list(box.low), "high": list(box.high)} for box in world.box],
         "shaped": shaped,
     }
+
+
+def _sticks(model: Model, x: ca.SX) -> tuple[list[ca.SX], list[str]]:
+    """Return both ends of links without shapes, [m] at coordinates x (n_q,), and their bodies' names.
+
+    From joint to joint, from the last joint to its body's centre of mass.
+    """
+    machine = model.machine
+    frames = trajectories.body_frames(machine, model.true_coordinates(x, model.nominal))
+    ends: list[ca.SX] = []
+    owners = []
+    carrying = {b.antecedent for b in machine.body}
+    for body in machine.body:
+        R, P = frames[body.index]
+        if not isinstance(body.antecedent, str):
+            ends += [frames[body.antecedent][1], P]
+            owners.append(machine.find(body.antecedent).name)
+        if body.index not in carrying and body.inertia is not None:
+            ends += [P, P + R @ ca.SX(np.array(body.inertia.com.value))]
+            owners.append(body.name)
+    return ends, owners
+
+
+def _reach(model: Model) -> float:
+    """Return the sum of the distances [m] from joint to joint."""
+    return sum(float(np.hypot(float(b.d), float(b.r))) for b in model.machine.body) or 1.0
 
 
 def _positions(model: Model, q: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from .baselines import (
 )
 from .campaign import Campaign as Campaign, CampaignTrial as CampaignTrial, design_campaign as design_campaign
 from .clearance import (
+    body_frames as body_frames,
     has_shapes as has_shapes,
     pairs_left_out as pairs_left_out,
     placed_shapes as placed_shapes,

@@ -30,7 +30,9 @@ def test_links_without_shapes_are_sticks_from_joint_to_joint(motion: Motion) -> 
     t, ends = np.array(scene["t"]), np.array(scene["ends"]).reshape(len(scene["t"]), -1, 6)
     assert t[[0, -1]] == pytest.approx([0, 2])
     elbow = 0.4 * np.column_stack([np.cos(np.sin(t)), np.sin(np.sin(t))])
-    assert ends[:, 1, 3:5] == pytest.approx(elbow, abs=1e-3)
+    assert ends[:, 0, 3:5] == pytest.approx(elbow, abs=1e-3)
+    assert ends[:, 1, :2] == pytest.approx(elbow, abs=1e-3)
+    assert scene["names"] == ["upper_arm", "forearm"]
     assert not scene["shaped"]
     assert np.array(scene["q"])[:, 0] == pytest.approx(np.degrees(np.sin(t)), abs=1e-2)
 
