@@ -453,10 +453,14 @@ class MotionProgram:
 
     # ------------------------------------------------------------------------------------------ solve
 
-    def solve(self, x: np.ndarray, should_stop: Callable[[], bool], max_iterations: int) -> MotionOptimum:
+    def solve(
+        self, x: np.ndarray, should_stop: Callable[[], bool], max_iterations: int, reach: float = np.inf
+    ) -> MotionOptimum:
         """Minimise the objective from x (n_x,) under the limits, in so many iterations at most.
 
-        SLSQP gives up where the highest sample of a limit changes; it then begins anew from there.
+        SLSQP gives up where the highest sample of a limit changes; it then begins anew from there. reach: farthest that
+        a coefficient may move before that [rad, m]. The first steps know no curvature and may leave the limits far
+        behind: a motion that is near its optimum needs a small one.
         """
         best: list[tuple[float, np.ndarray]] = []
         latest, done = np.array(x), 0
@@ -476,9 +480,11 @@ class MotionProgram:
         slsqp: Any = minimize  # its types know no callback that ends it
         try:
             while True:
+                latest = best[0][1] if best and np.isfinite(reach) else latest
                 slsqp(
                     self.value_and_gradient,
                     latest,
+                    bounds=None if np.isinf(reach) else np.column_stack([latest - reach, latest + reach]),
                     jac=True,
                     method="SLSQP",
                     constraints=constraints,

@@ -77,6 +77,8 @@ class Stage:
 
 
 FIRST_STAGE = Stage("fourier", 30, 200)
+NEAR_REACH = 0.1  # rad or m that a coefficient of a motion near its optimum may move before a new beginning; chosen
+WARM_ITERATIONS = 120  # of a motion that is known, at the last stage: it is near an optimum already; chosen
 TRAJECTORIES: dict[str, tuple[Stage, ...]] = {  # stages by the kind of motion; iterations chosen for a minute
     "free": (FIRST_STAGE, Stage("free", 30, 150), Stage("free", 100, 250)),
     "fourier": (FIRST_STAGE, Stage("fourier", 100, 300), Stage("fourier", 300, 300)),
@@ -270,12 +272,14 @@ def search(
     """Yield the best motion so far after every stage of a start: from a seed, or from a motion at the last stage."""
     smooth = with_smooth_friction(model)
     poses = end_poses(model, problem)
-    stages = TRAJECTORIES[trajectory] if isinstance(begin, int) else TRAJECTORIES[trajectory][-1:]
+    stages = TRAJECTORIES[trajectory]
+    if isinstance(begin, Motion):
+        stages = (replace(stages[-1], iterations=WARM_ITERATIONS),)
     program = MotionProgram(smooth, problem, objective, motion_basis(model, problem, stages[0].basis, *poses))
-    if isinstance(begin, int):
-        x = best_guess(program, free_poses(model, problem, objective.machines[1:]), begin, should_stop)
-    else:
+    if isinstance(begin, Motion):
         x = program.unknowns(fit_coefficients(program.basis, begin.t, begin.q))
+    else:
+        x = best_guess(program, free_poses(model, problem, objective.machines[1:]), begin, should_stop)
     best = score_joint_motion(model, problem, objective, stages[0].basis, program.coefficients(x))
     guess = _as_motion(model, problem, stages[0].basis, best.coefficients).sample(model)
     first = objectives.cond_phi(model, guess)
@@ -288,7 +292,8 @@ def search(
         program.sharpness = stage.sharpness
         program.objective = _calibrated(model, problem, objective, best)
         for repair in range(1 + (REPAIRS if stage is stages[-1] else 1)):
-            found = program.solve(x, should_stop, REPAIR_ITERATIONS if repair else stage.iterations)
+            most = REPAIR_ITERATIONS if repair else stage.iterations
+            found = program.solve(x, should_stop, most, NEAR_REACH if isinstance(begin, Motion) else np.inf)
             iterations += found.iterations
             x = found.x
             scored = score_joint_motion(model, problem, objective, stage.basis, program.coefficients(x))

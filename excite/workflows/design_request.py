@@ -389,7 +389,8 @@ def _make_accurate(
         if best is not None and search.worst(found.drive) > reached[best]:
             warm = [found.drive, lowest.random[best]]
             found = search.find("cond", warm, 0.5, sigma_max=reached[best]) or found
-        accurate = search.find("accuracy", [found.drive], 1.0) if request.other_end else None
+        other_end = request.other_end and not model.follows_positions  # a minute more, for an arm
+        accurate = search.find("accuracy", [found.drive], 1.0) if other_end else None
         ends = replace(ends, accurate=accurate, random_percent=None if best is None else reached[best])
     except KeyboardInterrupt:
         lowest = replace(lowest, complete=False)
