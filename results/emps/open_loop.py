@@ -1,9 +1,9 @@
 """Score EMPS as the benchmark does: fit one log, simulate the other from its forces alone, error in mm.
 
 python results/emps/open_loop.py [DATA_EMPS.mat] [--test DATA_EMPS_PULSES.mat] [--out FOLDER] writes open_loop.json and
-open_loop.md. The second log stands beside the first one where that was taken from. Without it the halves of the first one are fitted and simulated, each in turn. Rows are the
-estimates of `excite identify`, and fits of the simulation error: the parameters, and magnitudes of effects, whose
-simulation from the forces has the smallest position error on the log that is fitted.
+open_loop.md. The second log is handed out with the first one. Without it the halves of the first one are fitted and
+simulated, each in turn. Rows are the estimates of `excite identify`, and fits of the simulation error: the parameters,
+and magnitudes of effects, whose simulation from the forces has the smallest position error on the log that is fitted.
 """
 
 from __future__ import annotations
