@@ -97,6 +97,7 @@ def design(
     budget: float | None = None,
     solver: str = "own",
     trajectory: str | None = None,
+    payload: float | None = None,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> ShownDesign:
     """Design a test drive that makes the parameters of a machine identifiable.
@@ -113,6 +114,7 @@ def design(
     budget [s]: time after which the search stops.
     solver: a name of `excite.trajectories.SOLVERS`: `own`, or `ipopt` for a check.
     trajectory: of an arm, a name of `excite.trajectories.TRAJECTORIES`: `free`, the default, or `fourier`.
+    payload [kg]: of an arm, design for the payload's parameters, from drives without and with it.
     progress(done, total, best score): called during the search.
     Raises InfeasibleError with the limit that can't be kept, SolverError if the solver finds no optimum, UsageError for
     an unknown name.
@@ -130,6 +132,7 @@ def design(
         solver=solver,
         of=None if of is None else Path(of),
         trajectory=trajectory,
+        payload_kg=payload,
     )
     model, name, chosen = workflows.prepare_design(_as_given(machine), problem, duration, request)
     begin = time.perf_counter()
@@ -149,6 +152,7 @@ def campaign(
     within: float | None = None,
     after: Sequence[str | Path] = (),
     of: str | Path | None = None,
+    payload: float | None = None,
     starts: int = 2,
     seed: int = 0,
     budget: float | None = None,
@@ -171,6 +175,7 @@ def campaign(
         seed=seed,
         budget_s=budget,
         of=None if of is None else Path(of),
+        payload_kg=payload,
     )
     model, name, chosen = workflows.prepare_design(_as_given(machine), problem, duration, one)
     request = workflows.check_campaign(CampaignRequest(general, single, drives, within, one), model, chosen)

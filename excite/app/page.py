@@ -42,6 +42,7 @@ ACTIONS = {
 }
 LINKS = {
     "report.html": "report",
+    "motion.html": "motion in a window of its own",
     "sheet.pdf": "sheet for the driver (PDF)",
     "driver.html": "page for the cab",
     "profile.csv": "profile (CSV)",
@@ -284,6 +285,9 @@ class Window:
                 self._figures(result)
 
     def _figures(self, result: Result) -> None:
+        if (result.folder / reports.MOTION_PAGE).is_file():
+            frame = ui.element("iframe").style("width: 100%; aspect-ratio: 1.35; border: 0")
+            frame.props["src"], frame.props["title"] = self._url(result.folder / reports.MOTION_PAGE), "the motion"
         for picture in reports.folder_pictures(result.folder, result.summary):
             with ui.expansion(picture.folded).classes("more-settings") if picture.folded else nullcontext():
                 self._figure(picture.path, picture.caption)

@@ -71,6 +71,14 @@ WithinOption = Annotated[
         "--within", help="for --target: longest time of driving, in seconds; no drive is longer than --duration"
     ),
 ]
+PayloadOption = Annotated[
+    float | None,
+    typer.Option(
+        "--payload",
+        help="of an arm: mass in kg of a payload whose inertia, from the difference between driving without and with"
+        " it, is to be accurate; limits are kept in both",
+    ),
+]
 DriverOption = Annotated[bool, typer.Option("--driver", help="design for a person at the levers, in phases")]
 PhaseMinOption = Annotated[float, typer.Option("--phase-min", help="shortest phase for --driver, in seconds")]
 
@@ -90,6 +98,7 @@ def design(
     target: TargetOption = None,
     drives: DrivesOption = 1,
     within: WithinOption = None,
+    payload: PayloadOption = None,
     driver: DriverOption = False,
     phase_min: PhaseMinOption = 3.0,
     starts: StartsOption = 2,
@@ -108,6 +117,7 @@ def design(
     Example: excite design va12 --duration 30 --objective accuracy
     Example: excite design va12 --target 0.5 --drives 3
     Example: excite design ur10 --trajectory fourier
+    Example: excite design ur10 --payload 3 --target 5 --drives 2
     """
     from excite.workflows import CampaignRequest, DesignRequest
 
@@ -133,6 +143,7 @@ def design(
         solver,
         of,
         trajectory,
+        payload_kg=payload,
     )
     out = out or Path(f"results/design-{workflows.machine_stem(machine)}")
     inputs = [*machine_file(machine), *(after or []), *([] if of is None else [of])]

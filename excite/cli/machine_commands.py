@@ -174,6 +174,39 @@ def write_model(
     _say_written(saved.model.machine.name, out, what, notes, json)
 
 
+@machine_files.command("around")
+def write_surroundings(
+    meshes: Annotated[
+        list[Path],
+        typer.Argument(metavar="MESH...", help="meshes of what stands around an arm: .stl, .obj, .ply"),
+    ],
+    at: Annotated[
+        str, typer.Option("--at", help="where their origin is in the ground's frame, in m, with commas between")
+    ] = "0,0,0",
+    unit: Annotated[float, typer.Option("--unit", help="metres per unit of length in the files, 0.001 for mm")] = 1.0,
+    json: JsonOption = False,
+) -> None:
+    """Print boxes and capsules that hold what meshes show, for [world] of an arm's machine file.
+
+    Example: excite machine around table.stl fence.stl --unit 0.001
+    """
+    from excite.cli import machine_template
+
+    try:
+        place = [float(x) for x in at.split(",")]
+    except ValueError:
+        place = []
+    if len(place) != 3:
+        raise UsageError(f"--at: needs three numbers with commas between, such as 0.5,0,-0.1 (got {at})")
+    workflows.require_positive("--unit", unit, "m")
+    each = [workflows.things_around(mesh, place, unit) for mesh in meshes]
+    world = {key: [table for one in each for table in one[key]] for key in ("box", "shape")}
+    if json:
+        terminal.show_json(world)
+        return
+    terminal.say(machine_template.world_text(world))
+
+
 @machine_files.command("check", cls=DrawingCommand)
 def check_machine(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="a machine file (.toml)")],

@@ -146,6 +146,11 @@ def _dumped(tables: dict[str, Any], header: str = "") -> str:
     return "".join((*lines, *below))
 
 
+def world_text(world: dict[str, Any]) -> str:
+    """Return the text of [world] tables of a machine file, by key."""
+    return _dumped(world, "world").strip()
+
+
 def _explained(line: str, says: str | None) -> str:
     """Add a meaning to a line of TOML, before the comment that it has."""
     if says is None:

@@ -51,6 +51,11 @@ from .html import (
     templates as templates,
 )
 from .log_check import check_log as check_log, log_account as log_account, log_frame as log_frame
+from .motion_view import (
+    MOTION_PAGE as MOTION_PAGE,
+    motion_scene as motion_scene,
+    write_motion_page as write_motion_page,
+)
 from .pages import REPORT as REPORT, folder_pictures as folder_pictures, write_report as write_report
 from .plain_text import PIPE_WIDTH as PIPE_WIDTH, text_parts as text_parts, text_table as text_table
 from .results import (

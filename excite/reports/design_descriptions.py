@@ -20,6 +20,7 @@ from excite.reports.description import (
     meaning_column,
     meaning_index,
 )
+from excite.reports.payload_descriptions import payload_remarks, payload_tables
 from excite.smoothing import MAX_IDENTIFIABLE_STD
 from excite.text import count, format_number, format_percent
 from excite.trajectories import TOLERANCE
@@ -80,7 +81,8 @@ def describe_design(s: Summary) -> Description:
         remarks.append("Cut short: this is the best drive so far, more time may find a better one.")
     if s.get("advice"):
         remarks.append(s["advice"])
-    tables = [*_ends_table(s), _sigma_table(s)]
+    remarks = [*payload_remarks(s), *remarks]
+    tables = [*payload_tables(s), *_ends_table(s), _sigma_table(s)]
     if s.get("driver"):
         by_hand_remarks, by_hand_tables = _describe_by_hand(s)
         remarks = [*by_hand_remarks, *remarks]
@@ -160,7 +162,8 @@ def describe_campaign(s: Summary) -> Description:
     """Describe drives designed together: the target, what is attained, each drive, what else was tried."""
     n, target = len(s["drives"]), format_percent(s["target_percent"])
     what = {
-        "worst": f"every parameter is known to {format_percent(s['attained_percent'], 3)} or better",
+        "worst": f"every parameter{' of the payload' * ('payload' in s)} is known to"
+        f" {format_percent(s['attained_percent'], 3)} or better",
         "discrimination": f"every effect is identified to {format_percent(s['attained_percent'], 3)} or better",
     }.get(s["objective"], f"{s['objective']} is {format_percent(s['attained_percent'], 3)}")
     length = f"{count(n, 'drive')} of {format_number(s['duration_s'], 4)} s"
@@ -185,7 +188,7 @@ def describe_campaign(s: Summary) -> Description:
             f" (target {target})."
         )
     headline = f"{headline[:-1]}; one standard deviation, Cramer-Rao bound."
-    remarks = []
+    remarks = payload_remarks(s)
     if not s["complete"]:
         remarks.append("Cut short: this is the best so far, more time may find fewer or shorter drives.")
     missed = [t for t in s["trials"] if t["drives"] == n and t["duration_s"] < s["duration_s"]]
@@ -214,6 +217,7 @@ def describe_campaign(s: Summary) -> Description:
     tables = (
         Table("Drives, and what each attains alone.", ("folder", "s", "%"), shown),
         Table("What was tried, and what it attains together.", ("drives", "s each", "%"), tried),
+        *payload_tables(s),
         _sigma_table(s),
     )
     return Description(f"Campaign for {s['machine']}, problem {s['problem']}", headline, tables, tuple(remarks))

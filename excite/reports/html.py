@@ -73,11 +73,13 @@ def report_page(
     remarks: Sequence[str] = (),
     status: str = "valid",
     verdict: str = "",
+    scene: str = "",
+    scene_script: str = "",
 ) -> str:
     """Render a printable report: the answer first, then remarks, figures, tables and how it was made.
 
     answer: one sentence, coloured by status (valid, doubtful or invalid); below the verdict, if there is one. remarks:
-    a sentence each. how: name -> value, `command` among them.
+    a sentence each. how: name -> value, `command` among them. scene, scene_script: data and drawing of a motion.
     """
     own = Path(__file__).parents[1].joinpath("templates", "report.js").read_text(encoding="utf-8")
     library = [charts.library()] if any(figure.chart for figure in figures) else []
@@ -91,7 +93,8 @@ def report_page(
         how=dict(how or {}),
         remarks=remarks,
         status=status,
-        scripts=[*library, own],
+        scene=scene,
+        scripts=[*library, own, *([scene_script] if scene else [])],
     )
 
 

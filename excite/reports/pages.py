@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from excite import output
 from excite.reports import charts
@@ -12,6 +13,7 @@ from excite.reports.description import Summary
 from excite.reports.descriptions import describe
 from excite.reports.estimate_descriptions import validated_log
 from excite.reports.html import Picture, report_page
+from excite.reports.motion_view import motion_script, scene_data, write_motion_page
 from excite.text import format_number
 
 REPORT = "report.html"
@@ -75,10 +77,12 @@ def write_page(
     summary: Summary,
     command: str | None = None,
     explorable: Mapping[str, Explorable] | None = None,
+    scene: Mapping[str, Any] | None = None,
 ) -> None:
     """Write report.html of a folder from its summary and figures. Raises KeyError for an unknown kind.
 
     command: how it was made, the command line by default. explorable: what of each figure a chart shows.
+    scene: an arm's motion to look at (`motion_scene`), also written as a page of its own.
     """
     description = describe(kind, summary)
     text = report_page(
@@ -90,7 +94,11 @@ def write_page(
         description.remarks,
         description.status,
         description.verdict,
+        "" if scene is None else scene_data(scene),
+        motion_script(),
     )
+    if scene is not None:
+        write_motion_page(scene, place)
     (place / REPORT).write_text(text, encoding="utf-8")
 
 
@@ -120,9 +128,10 @@ def write_report(
     summary: Summary,
     command: str | None = None,
     explorable: Mapping[str, Explorable] | None = None,
+    scene: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write report.html and summary.json of a folder, after its figures; command, explorable as in `write_page`."""
-    write_page(place, kind, summary, command, explorable)
+    """Write report.html and summary.json of a folder, after its figures; options as in `write_page`."""
+    write_page(place, kind, summary, command, explorable, scene)
     output.write_summary(place, summary, command)
 
 

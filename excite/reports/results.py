@@ -33,7 +33,7 @@ class Account:
     kind: as `describe` takes it. summary: content of summary.json. figures: each by its file name, the main one first.
     files: each writes other files into a folder. drawn: figures more, which `draw` writes into a folder, several at a
     time, returning what of them a chart shows.
-    frame: the numbers as a table, with units in `attrs["units"]`.
+    frame: the numbers as a table, with units in `attrs["units"]`. scene: an arm's motion to look at.
     """
 
     kind: str
@@ -43,6 +43,7 @@ class Account:
     files: Sequence[Callable[[Path], object]] = ()
     drawn: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
     draw: Callable[[Path], Mapping[str, Explorable]] | None = None
+    scene: Callable[[], dict[str, Any]] | None = None
 
     def write(self, place: Path, command: str | None = None) -> dict[str, Any]:
         """Fill a folder with files, figures, report.html and summary.json; return the summary.
@@ -54,7 +55,8 @@ class Account:
         explorable = {} if self.draw is None else dict(self.draw(place))
         for name, draw in self.figures.items():
             explorable[name] = drawings.save(draw(), place / name)
-        pages.write_report(place, self.kind, self.summary, command, explorable)
+        scene = None if self.scene is None else self.scene()
+        pages.write_report(place, self.kind, self.summary, command, explorable, scene)
         return self.summary
 
 

@@ -11,7 +11,14 @@ from .baselines import (
     compare as compare,
 )
 from .campaign import Campaign as Campaign, CampaignTrial as CampaignTrial, design_campaign as design_campaign
-from .clearance import has_shapes as has_shapes, pairs_left_out as pairs_left_out
+from .clearance import (
+    body_frames as body_frames,
+    has_shapes as has_shapes,
+    pairs_left_out as pairs_left_out,
+    placed_shapes as placed_shapes,
+    random_poses as random_poses,
+    tool_point as tool_point,
+)
 from .composite_objective import (
     COND_MAX as COND_MAX,
     SIGMA_MAX as SIGMA_MAX,
@@ -21,6 +28,7 @@ from .composite_objective import (
     covariance_bound as covariance_bound,
     information_matrices as information_matrices,
     local_model as local_model,
+    motion_bound as motion_bound,
     rival_contrasts as rival_contrasts,
     score_matrices as score_matrices,
     score_motions as score_motions,
@@ -28,6 +36,7 @@ from .composite_objective import (
     surrogate_ratio as surrogate_ratio,
 )
 from .continuation import SOLVERS as SOLVERS
+from .drive_search import design_drive as design_drive
 from .excitation import Manoeuvre as Manoeuvre, multisine as multisine, scale_torques as scale_torques
 from .joint_motion import JointMotion as JointMotion, MotionProgram as MotionProgram, between_samples as between_samples
 from .joint_search import (
@@ -77,12 +86,14 @@ from .objective import (
     reference_values as reference_values,
     relative_std_percent as relative_std_percent,
     reported_value as reported_value,
+    row_noise as row_noise,
 )
 from .prediction_contrasts import prediction_contrasts as prediction_contrasts
 from .rehearsal import (
     JointCourse as JointCourse,
     PlannedMotion as PlannedMotion,
     Rehearsal as Rehearsal,
+    clearances as clearances,
     planned_motion as planned_motion,
     rehearse as rehearse,
 )

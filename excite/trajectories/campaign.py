@@ -9,17 +9,17 @@ Every length is a design of its own, so an accuracy that is not reached is one t
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from excite import smoothing
 from excite.errors import InfeasibleError, SolverError
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.trajectories import composite_objective, objective as objectives
-from excite.trajectories.multistart import Design, design
+from excite.trajectories.drive_search import design_drive
+from excite.trajectories.multistart import Design
 
 MAX_LENGTHS = 6  # durations that are tried for one number of drives; chosen
 LENGTH_RESOLUTION = 0.04  # relative difference of a duration that is too short from one that is not; chosen
@@ -82,20 +82,36 @@ def design_campaign(
     budget_s: float | None = None,
     progress: Callable[[int, int, float], None] | None = None,
     solver: str = "own",
+    trajectory: str | None = None,
+    machines: Sequence[Model] = (),
 ) -> Campaign:
     """Design the fewest drives, then the shortest, that attain a target together; the best found if none do.
 
     target [%]: of the objective's reported value, by default the worst parameter's relative standard deviation.
     most: largest number of drives. within_s [s]: longest time of driving. The problem's duration is the longest one of
     a single drive. objective: a name in OBJECTIVES that is shown in per cent.
-    contrasts, prior: as in `compose_objective`. The other arguments: as in `design`.
+    contrasts, prior: as in `compose_objective`. machines: those whose limits an arm keeps (`CompositeObjective`). The
+    other arguments: as in `design_drive`.
 
     Raises ValueError for an objective that is not shown in per cent, and what `design` raises if no drive of the
     longest duration keeps the limits.
     """
     if objectives.OBJECTIVES[objective].shown_as != "percent":
         raise ValueError(f"objective {objective}: a target needs one in per cent")
-    search = _CampaignSearch(model, problem, objective, contrasts, prior, starts, seed, solver, budget_s, progress)
+    search = _CampaignSearch(
+        model,
+        problem,
+        objective,
+        contrasts,
+        prior,
+        starts,
+        seed,
+        solver,
+        trajectory,
+        tuple(machines),
+        budget_s,
+        progress,
+    )
     best: _Found | None = None
     longest = float(problem.duration_s)
     for count in range(1, most + 1):
@@ -156,6 +172,8 @@ class _CampaignSearch:
         starts: int,
         seed: int,
         solver: str,
+        trajectory: str | None,
+        machines: tuple[Model, ...],
         budget_s: float | None,
         progress: Callable[[int, int, float], None] | None,
     ) -> None:
@@ -163,6 +181,7 @@ class _CampaignSearch:
         n = len(model.scale)
         self.prior = np.zeros((n, n)) if prior is None else prior
         self.starts, self.seed, self.solver, self.progress = starts, seed, solver, progress
+        self.trajectory, self.machines = trajectory, machines
         self.deadline = None if budget_s is None else time.time() + budget_s
         self.trials: list[CampaignTrial] = []
         self.cut = False
@@ -204,11 +223,12 @@ class _CampaignSearch:
         self, problem: Problem, others: list[Design], starts: int, seed: int, warm: Design | None = None
     ) -> Design:
         left = None if self.deadline is None else max(1.0, self.deadline - time.time())
-        known = [] if warm is None else [warm.manoeuvre]
+        known = [] if warm is None else [warm.drive]
         aim = composite_objective.compose_objective(
             self.model, self.objective, prior=self._information(others), contrasts=self.contrasts
         )
-        made = design(self.model, problem, aim, starts, seed, left, None, known, self.solver)
+        aim = replace(aim, machines=self.machines)
+        made = design_drive(self.model, problem, aim, starts, seed, left, None, known, self.solver, self.trajectory)
         self.cut = self.cut or not made.complete
         return made
 
@@ -217,7 +237,7 @@ class _CampaignSearch:
         by = np.outer(self.model.scale, self.model.scale)
         total = self.prior * by
         for d in drives:
-            total = total + np.linalg.inv(smoothing.cramer_rao(self.model, d.motion) / by)
+            total = total + np.linalg.inv(composite_objective.motion_bound(self.model, d.motion) / by)
             total = total - self.model.known.information(self.model.scale)  # counts once, with the last drive
         return np.asarray(total / by)
 

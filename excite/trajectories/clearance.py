@@ -106,6 +106,11 @@ def pairs(model: Model, q: ca.SX) -> list[Pair]:
     return [p for p in found if frozenset(p.names) not in apart]
 
 
+def placed_shapes(model: Model, q: ca.SX) -> list[Piece]:
+    """Return the shapes on ground and bodies at coordinates q (n_q,), without shapes the joints' origins as points."""
+    return _pieces(model.machine, model.true_coordinates(q, model.nominal))
+
+
 def _pieces(machine: Machine, q: ca.SX) -> list[Piece]:
     """Return the shapes on ground and bodies; without shapes, origins of joints and the tool as points."""
     frames = body_frames(machine, q)

@@ -10,15 +10,16 @@ regressor is a smooth surrogate of it; `calibrate_surrogates` makes both agree a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from excite import smoothing
-from excite.model import Model
+from excite.model import Model, with_least_smoothing
 from excite.simulation import Motion, effect_inputs
 from excite.trajectories import objective as objectives
+from excite.trajectories.arm_bound import arm_bound
 from excite.trajectories.objective import (
     EXACT_SHARPNESS,
     OBJECTIVES,
@@ -29,6 +30,7 @@ from excite.trajectories.objective import (
 
 CEILING_PRICE = 30.0  # price of a log variance above a ceiling, per unit; chosen
 CEILING_WIDTH = 0.01  # log variance over which that hinge is rounded; chosen
+FRICTION_RATE = 0.08  # rad/s or m/s over which dry friction of arms is smoothed in a search; chosen
 SIGMA_MAX = "sigma-max"  # name of the ceiling among the violations of a drive
 COND_MAX = "cond-max"  # the same of a largest condition number
 
@@ -60,8 +62,8 @@ class CompositeObjective:
 
     row_weights (n_blocks, n_rows) [1/SI]: factors of the regressor's rows. scale (n_base,) [SI]. sigma_max [%]: bound
     on the Cramer-Rao standard deviation of the least accurate parameter. prior (n_base, n_base), in the scale.
-    machines: machines that the drive is for, one term each; empty for the nominal machine alone. cond_max: bound on
-    cond(Phi).
+    machines: machines that the drive is for, the nominal one first; empty for that alone. Each has a term of its own,
+    or the nominal one has the only term and the others just keep their limits. cond_max: bound on cond(Phi).
     """
 
     name: str
@@ -72,6 +74,11 @@ class CompositeObjective:
     prior: np.ndarray | None = None
     machines: tuple[Model, ...] = ()
     cond_max: float | None = None
+
+    def judged(self, model: Model) -> tuple[Model, ...]:
+        """Return the machines whose motions are scored, one per term that is no ceiling."""
+        scored = sum(t.ceiling is None for t in self.terms)
+        return (self.machines or (model,))[:scored]
 
 
 def compose_objective(
@@ -279,9 +286,24 @@ def _term_information(objective: CompositeObjective, term: Term, model: Model, m
     return information_matrices(replace(objective, row_weights=objective.row_weights[[term.block]]), model, motion)[0]
 
 
+def motion_bound(model: Model, motion: Motion, noise_factors: Mapping[str, float] | None = None) -> np.ndarray:
+    """Return the Cramer-Rao bound (n_base, n_base) [SI^2] of all sensors along a motion alone.
+
+    noise_factors, errors: as of `smoothing.cramer_rao`.
+    """
+    if model.follows_positions and model.plain:
+        return arm_bound(model, motion, noise_factors)
+    return smoothing.cramer_rao(model, motion, "full", noise_factors=noise_factors)
+
+
+def with_smooth_friction(model: Model) -> Model:
+    """Return the model with dry friction that turns over `FRICTION_RATE` at the fastest."""
+    return with_least_smoothing(model, dict.fromkeys((b.index for b in model.machine.body), FRICTION_RATE))
+
+
 def covariance_bound(objective: CompositeObjective, model: Model, motion: Motion) -> np.ndarray:
     """Return the Cramer-Rao bound (n_base, n_base) [SI^2] after the drive, with the prior information."""
-    C = smoothing.cramer_rao(model, motion, "full")
+    C = motion_bound(model, motion)
     if objective.prior is None:
         return C
     by = np.outer(objective.scale, objective.scale)

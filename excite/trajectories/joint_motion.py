@@ -10,7 +10,7 @@ The program minimises the objective of the information matrix A = sum Phi' Phi o
 with G the gradient of the objective in A, dF = 2 <Phi G, dPhi>.
 
 Dry friction turns within milliseconds at a reversal, too fast for the samples. The program smooths it over
-`FRICTION_RATE`; scores and limits of the result are those of the machine file.
+`FRICTION_RATE` (`with_smooth_friction`); scores and limits of the result are those of the machine file.
 
 Source: Swevers et al., "Optimal robot excitation and identification", IEEE Trans. Robotics and Automation 13, 1997 (the
 Fourier series).
@@ -18,7 +18,7 @@ Fourier series).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,7 +28,7 @@ from scipy.interpolate import BSpline
 from scipy.optimize import minimize
 
 from excite.errors import SimulationError
-from excite.model import Model, with_least_smoothing
+from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion, inverse_dynamics, motion_along, play_back
 from excite.trajectories import composite_objective
@@ -48,9 +48,9 @@ from excite.trajectories.limits import (
 HARMONICS = 5  # of a Fourier series; usual in the field
 SPLINE_DEGREE = 5  # torque rates are continuous; chosen
 MAX_SPLINE_PIECES = 60  # of a free motion, which bounds the size of the program; chosen
-FRICTION_RATE = 0.08  # rad/s or m/s over which the program smooths dry friction; chosen
 OBJECTIVE_HZ = 25.0  # rate of the samples of the information in the program; chosen
 LIMITS_HZ = {"fourier": 20.0, "free": 40.0}  # rate of the samples at which the program keeps limits; chosen
+FORCED = ("torque", "torque_rate", "power")  # kinds of limits that another machine on the same path has of its own
 DENSE_PER_SAMPLE = 20  # points per sample at which limits of a result are judged, at most; chosen
 DENSE_HZ = 2000.0  # rate of these points that suffices: a tenth of a knot's time is 20 ms
 FIRST_MARGIN = 2e-3  # share of a limit's range kept free in the program, for what happens between its samples; chosen
@@ -202,8 +202,12 @@ class JointMotion:
         return motion_along(model, t, self.at(t), self.at(t, 1), self.at(t, 2))
 
 
-def between_samples(model: Model, problem: Problem, motion: JointMotion) -> dict[str, float]:
+def between_samples(
+    model: Model, problem: Problem, motion: JointMotion, kinds: Sequence[str] | None = None
+) -> dict[str, float]:
     """Return the largest excess over every limit between samples, as a fraction of its range.
+
+    kinds: keys of LIMITS, to look at these alone; None for all.
 
     It is judged DENSE_PER_SAMPLE times per sample, or at DENSE_HZ if that is less.
 
@@ -219,6 +223,8 @@ def between_samples(model: Model, problem: Problem, motion: JointMotion) -> dict
     du = (u[points:] - u[:-points]) * rate
     du = np.vstack([du, np.tile(du[-1:], (points, 1))])
     limits, planned = machine_limits(model, problem), planned_limits(model)
+    if kinds is not None:
+        limits, planned = tuple(g for g in limits if g.kind in kinds), ()
     values = [
         *(stack_limits(model, limits)(q.T, nu.T, u.T, du.T).full() if limits else ()),
         *(stack_planned(model, planned)(a.T, motion.at(t, 3).T).full() if planned else ()),
@@ -229,11 +235,20 @@ def between_samples(model: Model, problem: Problem, motion: JointMotion) -> dict
     }
 
 
-def all_violations(model: Model, problem: Problem, motion: JointMotion) -> dict[str, float]:
-    """Return the largest excess over every limit, at the samples and between them, as a fraction of its range."""
+def all_violations(
+    model: Model, problem: Problem, motion: JointMotion, others: Sequence[Model] = ()
+) -> dict[str, float]:
+    """Return the largest excess over every limit, at the samples and between them, as a fraction of its range.
+
+    others: machines whose torques along the motion have to keep their limits as well.
+    """
     found = check_limits(model, problem, motion.sample(model))
-    between = between_samples(model, problem, motion)
-    return {name: max(found.get(name, 0.0), between.get(name, 0.0)) for name in found | between}
+    for excess in (
+        between_samples(model, problem, motion),
+        *(between_samples(m, problem, motion, FORCED) for m in others),
+    ):
+        found = {name: max(found.get(name, 0.0), excess.get(name, 0.0)) for name in found | excess}
+    return found
 
 
 def violations_as_followed(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
@@ -248,11 +263,6 @@ def violations_as_followed(model: Model, problem: Problem, motion: Motion) -> di
         return {FOLLOWING: np.inf}
     names = {g.name for g in machine_limits(model, problem)}
     return {n: x for n, x in check_limits(model, problem, followed).items() if n in names}
-
-
-def with_smooth_friction(model: Model) -> Model:
-    """Return the model with dry friction that turns over `FRICTION_RATE` at the fastest."""
-    return with_least_smoothing(model, dict.fromkeys((b.index for b in model.machine.body), FRICTION_RATE))
 
 
 class MotionProgram:
@@ -270,8 +280,10 @@ class MotionProgram:
         self._free = basis.free
         self._columns = self._free.ravel()
         machine = reachable_limits(model, machine_limits(model, problem))
+        forced = tuple(g for g in machine if g.kind in FORCED)
         planned = planned_limits(model)
-        self.limits = (*machine, *planned)
+        others = objective.machines[1:]
+        self.limits = (*machine, *forced * len(others), *planned)
         self.n_g = len(self.limits)
         self.margins = np.full(self.n_g, FIRST_MARGIN)
         rate, T = float(model.machine.sampling_hz), basis.duration
@@ -281,15 +293,25 @@ class MotionProgram:
         self._path, self._B = self._tables(np.linspace(0, T, n_w), 3)
         self._limit_path, self._limit_B = self._tables(np.linspace(0, T, round(T * LIMITS_HZ[basis.kind]) + 1), 4)
         self._bounded = np.array([np.isfinite(g.low) for g in self.limits], bool)
-        self._functions(model, machine, planned)
+        self._functions(model, machine, [m.nominal for m in others], forced, planned)
 
     def _tables(self, t: np.ndarray, orders: int) -> tuple[np.ndarray, np.ndarray]:
         """Return path (N, orders, n_q) and basis (N, orders, n_c) with their derivatives."""
         path = np.stack([self.basis.path(t, k) for k in range(orders)], axis=1)
         return path, np.stack([self.basis.evaluate(t, k) for k in range(orders)], axis=1)
 
-    def _functions(self, model: Model, machine: tuple[Limit, ...], planned: tuple[Limit, ...]) -> None:
-        """Build the regressor, the limits and their derivatives over all samples."""
+    def _functions(
+        self,
+        model: Model,
+        machine: tuple[Limit, ...],
+        others: Sequence[np.ndarray],
+        forced: tuple[Limit, ...],
+        planned: tuple[Limit, ...],
+    ) -> None:
+        """Build the regressor, the limits and their derivatives over all samples.
+
+        others: base parameters (n_base,) of further machines, whose torques keep the limits `forced`.
+        """
         n_q = self.n_q
         q, nu, a = model.symbols()
         jerk = ca.SX.sym("j", n_q)
@@ -299,16 +321,17 @@ class MotionProgram:
         N = len(self._path)
         self._W = _mapped([z], W, N, (self.n_b, n_q))
         self._W_slope = _mapped([z, C], ca.gradient(ca.sum1(ca.sum2(W * C)), z), N, (3 * n_q,))
-        u = inverse_dynamics(model)(q, nu, a, model.nominal)
-        du = ca.jtimes(u, z, ca.vertcat(nu, a, jerk))
+        values = []
+        for X, limits in ((model.nominal, machine), *((X, forced) for X in others if forced)):
+            u = inverse_dynamics(model)(q, nu, a, X)
+            values.append(stack_limits(model, limits)(q, nu, u, ca.jtimes(u, z, ca.vertcat(nu, a, jerk))))
         centre, half = np.array([_centre(g) for g in self.limits]), np.array([_half(g) for g in self.limits])
-        stacked = ca.vertcat(stack_limits(model, machine)(q, nu, u, du), stack_planned(model, planned)(a, jerk))
-        values = (stacked - centre) / half
-        slope = ca.jacobian(values, y)
+        scaled = (ca.vertcat(*values, stack_planned(model, planned)(a, jerk)) - centre) / half
+        slope = ca.jacobian(scaled, y)
         pattern = np.array(ca.DM(slope.sparsity(), 1).full(), bool).reshape(self.n_g, 4, n_q)
         self._depends: np.ndarray = np.asarray(pattern.any(axis=1))
         N = len(self._limit_path)
-        self._g = _mapped([y], values, N, (self.n_g,))
+        self._g = _mapped([y], scaled, N, (self.n_g,))
         self._g_jacobian = _mapped([y], slope, max(1, 2 * self.n_g), (4 * n_q, self.n_g))
 
     @property
@@ -430,10 +453,14 @@ class MotionProgram:
 
     # ------------------------------------------------------------------------------------------ solve
 
-    def solve(self, x: np.ndarray, should_stop: Callable[[], bool], max_iterations: int) -> MotionOptimum:
+    def solve(
+        self, x: np.ndarray, should_stop: Callable[[], bool], max_iterations: int, reach: float = np.inf
+    ) -> MotionOptimum:
         """Minimise the objective from x (n_x,) under the limits, in so many iterations at most.
 
-        SLSQP gives up where the highest sample of a limit changes; it then begins anew from there.
+        SLSQP gives up where the highest sample of a limit changes; it then begins anew from there. reach: farthest that
+        a coefficient may move before that [rad, m]. The first steps know no curvature and may leave the limits far
+        behind: a motion that is near its optimum needs a small one.
         """
         best: list[tuple[float, np.ndarray]] = []
         latest, done = np.array(x), 0
@@ -453,9 +480,11 @@ class MotionProgram:
         slsqp: Any = minimize  # its types know no callback that ends it
         try:
             while True:
+                latest = best[0][1] if best and np.isfinite(reach) else latest
                 slsqp(
                     self.value_and_gradient,
                     latest,
+                    bounds=None if np.isinf(reach) else np.column_stack([latest - reach, latest + reach]),
                     jac=True,
                     method="SLSQP",
                     constraints=constraints,

@@ -4,34 +4,34 @@ A start is the best of many random Fourier series within the limits. Its coeffic
 sharper and sharper maximum; a free motion then goes on from the Fourier series as a spline. Scores and limits are those
 of the machine file, the limits at DENSE_PER_SAMPLE points per sample; limits that are exceeded between the program's
 samples get a margin, and the last stage is repeated. The best motion is made a little smaller if it exceeds limits
-where a position controller follows it.
+where a position controller follows it. A motion that is known begins at the last stage.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import joblib
 import numpy as np
 
-from excite.errors import MachineError
+from excite.errors import MachineError, SimulationError
 from excite.model import Model
 from excite.model.machine import Problem
-from excite.simulation import motion_along
+from excite.simulation import Motion, motion_along
 from excite.trajectories import composite_objective, objective as objectives
 from excite.trajectories.clearance import drive_ranges, random_poses
-from excite.trajectories.composite_objective import SIGMA_MAX, CompositeObjective
+from excite.trajectories.composite_objective import COND_MAX, SIGMA_MAX, CompositeObjective, with_smooth_friction
 from excite.trajectories.excitation import Manoeuvre
 from excite.trajectories.joint_motion import (
+    Basis,
     JointMotion,
     MotionProgram,
     all_violations,
     motion_basis,
     violations_as_followed,
-    with_smooth_friction,
 )
 from excite.trajectories.limits import (
     LIGHTEN,
@@ -77,6 +77,8 @@ class Stage:
 
 
 FIRST_STAGE = Stage("fourier", 30, 200)
+NEAR_REACH = 0.1  # rad or m that a coefficient of a motion near its optimum may move before a new beginning; chosen
+WARM_ITERATIONS = 120  # of a motion that is known, at the last stage: it is near an optimum already; chosen
 TRAJECTORIES: dict[str, tuple[Stage, ...]] = {  # stages by the kind of motion; iterations chosen for a minute
     "free": (FIRST_STAGE, Stage("free", 30, 150), Stage("free", 100, 250)),
     "fourier": (FIRST_STAGE, Stage("fourier", 100, 300), Stage("fourier", 300, 300)),
@@ -113,11 +115,12 @@ class ScoredMotion:
 
 @dataclass(frozen=True)
 class MotionState:
-    """The best motion of a start. complete: False if cut short. start_cond_phi: of the guess."""
+    """The best motion of a start. complete: False if cut short. start_cond_phi: of the guess, begun_from."""
 
     number: int
     best: ScoredMotion
     start_cond_phi: float
+    begun_from: Motion
     iterations: int
     complete: bool
 
@@ -148,30 +151,33 @@ def design_joint_motion(
     budget_s: float | None = None,
     progress: Report | None = None,
     trajectory: str = "free",
+    warm: Sequence[Motion] = (),
 ) -> Design:
     """Design the excitation of an arm as a motion of its joints: the best of several random starts.
 
-    trajectory: a name in TRAJECTORIES. Other arguments and Ctrl-C as in `multistart.design`, its errors too, and
-    MachineError for a machine that is no arm.
+    trajectory: a name in TRAJECTORIES. warm: motions that start at the last stage; `starts` may then be 0. Other
+    arguments and Ctrl-C as in `multistart.design`, its errors too, and MachineError for a machine that is no arm.
     """
     check_joint_motion(model, trajectory)
     composite = composite_objective.compose_objective(model, objective) if isinstance(objective, str) else objective
-    if starts < 1:
+    if starts < (0 if warm else 1):
         raise ValueError(f"starts must be at least 1, got {starts}")
-    free_poses(model, problem)
+    free_poses(model, problem, composite.machines[1:])
     deadline = None if budget_s is None else time.time() + budget_s
     seeds = np.random.SeedSequence(seed).generate_state(starts)
+    begins: list[int | Motion] = [*(int(s) for s in seeds), *warm]
     states: dict[int, MotionState] = {}
+    stages = starts * len(TRAJECTORIES[trajectory]) + len(warm)
     with (
         stop_file() as stop,
-        progress_reports(stop.parent, progress, starts * len(TRAJECTORIES[trajectory]), starts),
+        progress_reports(stop.parent, progress, stages, len(begins)),
         joblib.parallel_config("loky", inner_max_num_threads=1),
     ):
         run = joblib.Parallel(n_jobs=process_count(), return_as="generator_unordered")
         call = joblib.delayed(_run_start)
         with ignore_killed_workers(stop):
             for state in run(
-                call(model, problem, composite, trajectory, k, int(s), deadline, stop) for k, s in enumerate(seeds)
+                call(model, problem, composite, trajectory, k, begin, deadline, stop) for k, begin in enumerate(begins)
             ):
                 if state is not None:
                     states[state.number] = state
@@ -179,7 +185,7 @@ def design_joint_motion(
     if not states:
         raise KeyboardInterrupt
     best = min(states.values(), key=lambda t: (*t.best.rank, t.number))
-    complete = len(states) == starts and all(t.complete for t in states.values())
+    complete = len(states) == len(begins) and all(t.complete for t in states.values())
     if best.best.excess > TOLERANCE:
         if interrupted:
             raise KeyboardInterrupt(no_drive_yet(model, best.best.violations))
@@ -196,12 +202,13 @@ def design_joint_motion(
         min(t.start_cond_phi for t in states.values()),
         dict(chosen.violations),
         chosen.excess,
-        tuple(_reported(composite, states[k].best) if k in states else float("inf") for k in range(starts)),
+        tuple(_reported(composite, states[k].best) if k in states else float("inf") for k in range(len(begins))),
         complete,
         "slsqp",
         best.iterations,
         trajectory,
         chosen.followed,
+        tuple(states[k].begun_from for k in range(starts) if k in states),
     )
 
 
@@ -220,10 +227,12 @@ def score_joint_motion(
     """Score a motion by the machine file: the objective on all samples, every limit between samples too."""
     made = _as_motion(model, problem, basis, coefficients)
     motion = made.sample(model)
-    found = composite_objective.score_motions(objective, [(model, motion)])
-    violations = all_violations(model, problem, made)
+    found = composite_objective.score_motions(objective, [(m, made.sample(m)) for m in objective.judged(model)])
+    violations = all_violations(model, problem, made, objective.machines[1:])
     if objective.sigma_max is not None:
         violations[SIGMA_MAX] = max(0.0, found.worst_percent / objective.sigma_max - 1)
+    if objective.cond_max is not None:
+        violations[COND_MAX] = max(0.0, objectives.cond_phi(model, motion) / objective.cond_max - 1)
     score = found.score if np.isfinite(found.score) else float("inf")
     return ScoredMotion(basis, coefficients, score, violations)
 
@@ -234,16 +243,19 @@ def _run_start(
     objective: CompositeObjective,
     trajectory: str,
     number: int,
-    seed: int,
+    begin: int | Motion,
     deadline: float | None,
     stop: Path,
 ) -> MotionState | None:
-    """Run one start in a worker process; None if time is up before it begins, start 0 always runs."""
+    """Run one start in a worker process; None if time is up before it begins, start 0 always runs.
+
+    begin: a seed, or a motion to go on from.
+    """
     should_stop = begin_worker(stop, deadline)
     if number > 0 and should_stop():
         return None
     state = None
-    for k, found in enumerate(search(model, problem, objective, trajectory, seed, should_stop)):
+    for k, found in enumerate(search(model, problem, objective, trajectory, begin, should_stop)):
         state = replace(found, number=number)
         write_stage(model, stop, number, k, _reported(objective, state.best), state.best.violations)
     return state
@@ -254,15 +266,20 @@ def search(
     problem: Problem,
     objective: CompositeObjective,
     trajectory: str,
-    seed: int,
+    begin: int | Motion,
     should_stop: Callable[[], bool],
 ) -> Iterator[MotionState]:
-    """Yield the best motion so far after every stage of a start."""
+    """Yield the best motion so far after every stage of a start: from a seed, or from a motion at the last stage."""
     smooth = with_smooth_friction(model)
     poses = end_poses(model, problem)
     stages = TRAJECTORIES[trajectory]
+    if isinstance(begin, Motion):
+        stages = (replace(stages[-1], iterations=WARM_ITERATIONS),)
     program = MotionProgram(smooth, problem, objective, motion_basis(model, problem, stages[0].basis, *poses))
-    x = best_guess(program, free_poses(model, problem), seed, should_stop)
+    if isinstance(begin, Motion):
+        x = program.unknowns(fit_coefficients(program.basis, begin.t, begin.q))
+    else:
+        x = best_guess(program, free_poses(model, problem, objective.machines[1:]), begin, should_stop)
     best = score_joint_motion(model, problem, objective, stages[0].basis, program.coefficients(x))
     guess = _as_motion(model, problem, stages[0].basis, best.coefficients).sample(model)
     first = objectives.cond_phi(model, guess)
@@ -273,8 +290,10 @@ def search(
             program = MotionProgram(smooth, problem, objective, motion_basis(model, problem, stage.basis, *poses))
             x = _carried_over(before, program, x)
         program.sharpness = stage.sharpness
+        program.objective = _calibrated(model, problem, objective, best)
         for repair in range(1 + (REPAIRS if stage is stages[-1] else 1)):
-            found = program.solve(x, should_stop, REPAIR_ITERATIONS if repair else stage.iterations)
+            most = REPAIR_ITERATIONS if repair else stage.iterations
+            found = program.solve(x, should_stop, most, NEAR_REACH if isinstance(begin, Motion) else np.inf)
             iterations += found.iterations
             x = found.x
             scored = score_joint_motion(model, problem, objective, stage.basis, program.coefficients(x))
@@ -282,9 +301,23 @@ def search(
             if scored.excess <= ROUNDING or should_stop():
                 break
             program.widen_margins(scored.violations)
-        yield MotionState(0, best, first, iterations, not should_stop())
+            over = max(scored.violations.get(name, 0.0) for name in (SIGMA_MAX, COND_MAX))
+            program.objective = composite_objective.lower_ceilings(program.objective, over)
+        yield MotionState(0, best, first, guess, iterations, not should_stop())
         if should_stop():
             return
+
+
+def _calibrated(
+    model: Model, problem: Problem, objective: CompositeObjective, best: ScoredMotion
+) -> CompositeObjective:
+    """Return an objective whose surrogates of variances agree with the Cramer-Rao bound along a motion."""
+    motion = _as_motion(model, problem, best.basis, best.coefficients).sample(model)
+    try:
+        ratio = composite_objective.surrogate_ratio(objective, model, motion)
+    except SimulationError:
+        ratio = None
+    return objective if ratio is None else composite_objective.calibrate_surrogates(objective, ratio)
 
 
 def _drawn_back(model: Model, problem: Problem, objective: CompositeObjective, found: ScoredMotion) -> ScoredMotion:
@@ -322,15 +355,23 @@ def _with_followed(model: Model, problem: Problem, found: ScoredMotion) -> Score
 def _carried_over(before: MotionProgram, program: MotionProgram, x: np.ndarray) -> np.ndarray:
     """Return the coefficients of the program's basis that follow those of another one best."""
     t = np.linspace(0, program.basis.duration, 8 * program.n_c)
-    found = before.coefficients(x)
-    target = JointMotion(before.basis, found).at(t) - program.basis.path(t, 0)
-    moving = program.n_c - bool(program.basis.chosen)
-    carried = np.zeros((program.n_q, program.n_c))
-    if program.basis.chosen:
-        carried[:, -1] = found[:, -1]
+    return program.unknowns(fit_coefficients(program.basis, t, JointMotion(before.basis, before.coefficients(x)).at(t)))
+
+
+def fit_coefficients(basis: Basis, t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return the coefficients (n_q, n_c) of a basis that follow a motion q (N, n_q) at times t (N,) [s] best.
+
+    The first sample gives the poses that are chosen.
+    """
+    target = q - basis.path(t, 0)
+    moving = basis.count - bool(basis.chosen)
+    found = np.zeros((q.shape[1], basis.count))
+    if basis.chosen:
+        chosen = list(basis.chosen)
+        found[chosen, -1] = target[0, chosen]
         target = target - found[:, -1]
-    carried[:, :moving] = np.linalg.lstsq(program.basis.evaluate(t, 0)[:, :moving], target, rcond=None)[0].T
-    return program.unknowns(carried)
+    found[:, :moving] = np.linalg.lstsq(basis.evaluate(t, 0)[:, :moving], target, rcond=None)[0].T
+    return found
 
 
 def best_guess(program: MotionProgram, poses: np.ndarray, seed: int, should_stop: Callable[[], bool]) -> np.ndarray:
@@ -367,10 +408,10 @@ def best_guess(program: MotionProgram, poses: np.ndarray, seed: int, should_stop
     return np.asarray(chosen)
 
 
-def free_poses(model: Model, problem: Problem) -> np.ndarray:
+def free_poses(model: Model, problem: Problem, others: Sequence[Model] = ()) -> np.ndarray:
     """Return poses (k, n_q) that keep every limit at rest, the given ones as they are; half of each range is tried.
 
-    Raises MachineError if none does.
+    others: machines that keep them there as well. Raises MachineError if no pose does.
     """
     start, end = end_poses(model, problem)
     chosen = list(chosen_poses(model, problem))
@@ -381,17 +422,18 @@ def free_poses(model: Model, problem: Problem) -> np.ndarray:
     every = np.vstack([tried, end[None, :]]) if not chosen else tried
     limits = machine_limits(model, problem)
     still = np.zeros_like(every)
-    u = motion_along(model, np.arange(float(len(every))), every, still, still).u
-    values = stack_limits(model, limits)(every.T, still.T, u.T, 0 * u.T).full().reshape(len(limits), -1)
+    each = [motion_along(m, np.arange(float(len(every))), every, still, still).u for m in (model, *others)]
+    values = np.stack([stack_limits(model, limits)(every.T, still.T, u.T, 0 * u.T).full() for u in each])
     low_g, high_g = (np.array([getattr(g, key) for g in limits])[:, None] for key in ("low", "high"))
-    over = (values > high_g) | (values < low_g)
+    off = np.maximum(values - high_g, low_g - values).max(axis=0).reshape(len(limits), -1)
+    over = off > 0
     kept = ~over.any(axis=0)
     if (kept.all() if not chosen else kept.any()) or not limits:
         return tried[kept[: len(tried)]]
     often = limits[int(np.argmax(over.mean(axis=1)))]
     name = model.machine.name
     if chosen:
-        share = np.where(over, np.maximum(values - high_g, low_g - values), 0) / [[g.range] for g in limits]
+        share = np.where(over, off, 0) / [[g.range] for g in limits]
         nearest = every[[int(np.argmin(share.max(axis=0)))]]
         where = f"none of {len(tried)} random poses keeps every limit at rest"
         change = "give the problem a start_pose that does, or change shapes, floor or limits in the machine file"

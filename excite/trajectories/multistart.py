@@ -70,7 +70,7 @@ class Design:
 
     cond_phi, cond_w: condition numbers over every sample of `motion`. cond_phi_start: of the best random start.
     violations: excess by limit, as a fraction of its range, 0 where kept. scores: the objective of every start as
-    reported, inf for an infeasible one. random: the multisines that the search began from. complete: False if
+    reported, inf for an infeasible one. random: the drives that the search began from. complete: False if
     interrupted or cut short by the budget. solver: a name in SOLVERS; iterations: of the solver, from the start
     that won to this drive. trajectory: kind of joint motion, a name in TRAJECTORIES, None for torques; limits of a
     joint motion are also judged between samples. followed: excess over them where a position controller follows the
@@ -91,7 +91,12 @@ class Design:
     iterations: int = 0
     trajectory: str | None = None
     followed: dict[str, float] | None = None
-    random: tuple[Manoeuvre, ...] = ()
+    random: tuple[Manoeuvre | Motion, ...] = ()
+
+    @property
+    def drive(self) -> Manoeuvre | Motion:
+        """What a later search goes on from: the torques, of an arm its motion."""
+        return self.manoeuvre if self.trajectory is None else self.motion
 
 
 def design(

@@ -97,25 +97,34 @@ def rehearse(model: Model, motion: Motion) -> Rehearsal:
             low, high = (_extreme(t, x, int(i)) for i in (x.argmin(), x.argmax()))
             fastest = _extreme(t, np.abs(v), int(np.abs(v).argmax()))
             joints.append(JointCourse(body.where, body.joint, float(x[0]), low, high, fastest))
-    return Rehearsal(t, tuple(joints), tool, _extreme(t, speed, int(speed.argmax())), _near_passes(model, motion, q))
+    return Rehearsal(t, tuple(joints), tool, _extreme(t, speed, int(speed.argmax())), _near_passes(model, motion))
 
 
-def _near_passes(model: Model, motion: Motion, q: ca.SX) -> tuple[NearPass, ...]:
+def _near_passes(model: Model, motion: Motion) -> tuple[NearPass, ...]:
     """Return the NEAREST pairs of shapes with their distance [m], none without shapes."""
-    every = pairs(model, q)
-    kept = [every[k] for k in kept_pairs(model)]
-    if not has_shapes(model.machine) or not kept:
-        return ()
+    names, gaps = clearances(model, motion.q)
+    nearest = [_extreme(motion.t, gap, int(gap.argmin())) for gap in gaps]
+    ordered = sorted(zip(names, nearest, strict=True), key=lambda x: x[1].value)
+    return tuple(NearPass(pair, gap) for pair, gap in ordered[:NEAREST])
+
+
+def clearances(model: Model, q: np.ndarray) -> tuple[tuple[tuple[str, str], ...], np.ndarray]:
+    """Return the names of each two things that may touch, and distances (k, N) [m] of their shapes at q (N, n_q).
+
+    None without shapes.
+    """
+    x = ca.SX.sym("q", len(model.coordinates))
+    every = pairs(model, x)
+    kept = [every[k] for k in kept_pairs(model)] if has_shapes(model.machine) else []
     margin = float(model.machine.world.margin)
-    gaps = ca.vertcat(*[p.distance - (p.least - margin) for p in kept])
-    values = ca.Function("gaps", [q], [gaps], {"cse": True})(motion.q.T).full()
-    best: dict[tuple[str, str], Extreme] = {}
-    for pair, gap in zip(kept, values, strict=True):
-        found = _extreme(motion.t, gap, int(gap.argmin()))
-        if pair.names not in best or found.value < best[pair.names].value:
-            best[pair.names] = found
-    ordered = sorted(best.items(), key=lambda x: x[1].value)
-    return tuple(NearPass(names, gap) for names, gap in ordered[:NEAREST])
+    together: dict[tuple[str, str], ca.SX] = {}
+    for p in kept:
+        gap = p.distance - (p.least - margin)
+        together[p.names] = ca.fmin(together[p.names], gap) if p.names in together else gap
+    if not together:
+        return (), np.zeros((0, len(q)))
+    values = ca.Function("gaps", [x], [ca.vertcat(*together.values())], {"cse": True})(q.T).full()
+    return tuple(together), np.asarray(values)
 
 
 def _extreme(t: np.ndarray, values: np.ndarray, k: int) -> Extreme:

@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from excite import smoothing
 from excite.model import Model
 from excite.simulation import Motion
+from excite.trajectories.composite_objective import motion_bound
 from excite.trajectories.objective import relative_std_percent
 
 Change = Literal["none", "left out", "added", "half the noise", "twice the counts"]
@@ -54,9 +54,7 @@ def value_sensors(
     rows: list[SensorValue] = []
     before = np.ones(len(model.scale))
     for name, change, factors in changes:
-        sigma = relative_std_percent(
-            model, smoothing.cramer_rao(model, motion, "full", noise_factors={**lacking, **factors})
-        )
+        sigma = relative_std_percent(model, motion_bound(model, motion, {**lacking, **factors}))
         before = sigma if change == "none" else before
         worst = int(np.argmax(sigma))
         rows.append(

@@ -6,7 +6,7 @@ from .campaign_workflow import (
     check_campaign as check_campaign,
     read_targets as read_targets,
 )
-from .collision_shapes import add_shapes as add_shapes
+from .collision_shapes import add_shapes as add_shapes, things_around as things_around
 from .design_request import (
     DesignRequest as DesignRequest,
     design_from as design_from,

@@ -19,6 +19,7 @@ from excite.reports import Account
 from excite.trajectories import Campaign
 from excite.workflows import design_request, design_workflow, requests
 from excite.workflows.design_request import DesignRequest, DesignResult
+from excite.workflows.payload_design import loaded_machines, payload_summary
 from excite.workflows.progress import Bar, no_bar
 
 DEFAULT_OBJECTIVE = "worst"
@@ -74,14 +75,13 @@ def check_campaign(request: CampaignRequest, model: Model, problem: Problem) -> 
     allowed = [n for n, o in trajectories.OBJECTIVES.items() if o.shown_as == "percent"]
     if objective not in allowed:
         raise UsageError(f"--target: needs an --objective in per cent: {', '.join(allowed)} (got {objective})")
-    if model.follows_positions:
-        raise UsageError(f"--target: not for {model.machine.name}, an arm, whose designs are motions of its joints")
-    if one.trajectory is not None:
-        trajectories.check_joint_motion(model, one.trajectory)
+    design_request.check_arm_options(model, one)
     if one.driver or one.robust or one.sigma_max is not None:
         raise UsageError("--target: does not go with --driver, --robust or --sigma-max")
-    if request.parameters and objective != DEFAULT_OBJECTIVE:
-        raise UsageError(f"--target: targets of single parameters need --objective {DEFAULT_OBJECTIVE}")
+    if request.parameters and (objective != DEFAULT_OBJECTIVE or one.payload_kg is not None):
+        raise UsageError(
+            f"--target: targets of single parameters need --objective {DEFAULT_OBJECTIVE}, and go without --payload"
+        )
     for name, percent in request.parameters.items():
         requests.require_known("--target", name, model.base.names)
         requests.require_positive(f"--target {name}", percent, "%")
@@ -98,12 +98,13 @@ def check_campaign(request: CampaignRequest, model: Model, problem: Problem) -> 
 class CampaignResult:
     """Drives designed together for a model; with earlier logs, its nominal values are their estimate.
 
-    given_zeros: as in `DesignResult`.
+    given_zeros, assumed_noise: as in `DesignResult`.
     """
 
     model: Model
     campaign: Campaign
     given_zeros: tuple[str, ...] = ()
+    assumed_noise: tuple[str, ...] = ()
 
 
 def campaign_from(
@@ -117,10 +118,11 @@ def campaign_from(
     Raises MachineError for sensors of unknown noise, and the errors of `trajectories.design_campaign`.
     """
     one = request.design
+    model, assumed = design_request.with_assumed_noise(model)
     design_request.require_noise_figures(model)
     model, zeros = design_request.without_hidden_zeros(model)
     model, prior = design_request.with_earlier_logs(model, one.after)
-    contrasts = design_request.contrasts(model, one)
+    contrasts, machines = design_request.contrasts(model, one), loaded_machines(model, one.payload_kg)
     if request.parameters:
         by = {n: request.parameters.get(n, request.target) for n in model.base.names}
         counted = {n: t for n, t in by.items() if t is not None}
@@ -140,8 +142,10 @@ def campaign_from(
         one.budget_s,
         progress,
         one.solver,
+        one.trajectory,
+        machines,
     )
-    return CampaignResult(model, found, zeros)
+    return CampaignResult(model, found, zeros, assumed)
 
 
 def campaign(
@@ -214,6 +218,10 @@ def campaign_account(
     }
     if found.given_zeros:
         summary["given_zeros"] = list(found.given_zeros)
+    if found.assumed_noise:
+        summary["assumed_noise"] = list(found.assumed_noise)
+    if request.design.payload_kg is not None:
+        summary["payload"] = payload_summary(found.model, request.design.payload_kg, [d.motion for d in c.drives])
     if request.design.after:
         summary["after"] = [str(p) for p in request.design.after]
     title = f"{model.machine.title}: {name}"
@@ -234,7 +242,8 @@ def _write_drive(
 ) -> None:
     """Write drive k as a design folder of its own; its accuracy is that of the drive alone."""
     c = found.campaign
-    alone = DesignResult(found.model, trajectories.compose_objective(found.model, DEFAULT_OBJECTIVE), c.drives[k])
+    aim = trajectories.compose_objective(found.model, DEFAULT_OBJECTIVE)
+    alone = DesignResult(found.model, aim, c.drives[k], assumed_noise=found.assumed_noise)
     account = design_workflow.design_account(alone, name, problem.lasting(c.duration_s), request.design, 0.0)
     account.summary["advice"] = (
         f"drive {k + 1} of {len(c.drives)} that were designed together: the accuracy here is that of this drive alone"

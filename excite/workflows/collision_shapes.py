@@ -7,6 +7,7 @@ longest direction as long as that saves volume, so that an elbow is not filled u
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -18,6 +19,7 @@ from scipy.optimize import minimize
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
+from excite.errors import UsageError
 from excite.workflows.urdf import read_robot
 
 MAX_CAPSULES = 4  # of a link, which bounds the pairs whose distance is a limit
@@ -155,6 +157,45 @@ def add_shapes(path: Path, tables: dict[str, Any]) -> str | None:
             else:
                 tables["body"][k]["shape"] = shapes
     return None
+
+
+def things_around(path: Path, at: Sequence[float], unit: float = 1.0) -> dict[str, list[dict[str, Any]]]:
+    """Return the [world] tables, `box` and `shape`, that hold what a mesh file shows of a robot's surroundings.
+
+    at (3,) [m]: where the origin of the mesh is in the ground's frame. unit [m]: that of its lengths. Each connected
+    part becomes a box along the axes, or capsules where they take less room. Raises UsageError for a file that is no
+    mesh.
+    """
+    try:
+        import trimesh
+
+        mesh = trimesh.load(path, force="mesh")
+        parts = mesh.split(only_watertight=False)
+    except (OSError, ValueError, ImportError, AttributeError, NotImplementedError) as err:
+        raise UsageError(f"{path}: cannot be read as a mesh: {' '.join(str(err).split())}") from None
+    found: dict[str, list[dict[str, Any]]] = {"box": [], "shape": []}
+    for part in parts:
+        vertices = np.asarray(part.vertices) * unit + np.asarray(at, float)
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        fine, faces = trimesh.remesh.subdivide_to_size(vertices, part.faces, POINT_SPACING_M, max_iter=20)
+        capsules = capsules_around(np.asarray(fine)[faces])
+        if np.prod(high - low) <= sum(c.volume for c in capsules):
+            step = 10.0**-ROUND_DIGITS
+            number = "" if not found["box"] else str(len(found["box"]) + 1)
+            corners = [np.floor(low / step) * step, np.ceil(high / step) * step + step * (low == high)]
+            lowest, highest = (np.round(x, ROUND_DIGITS).tolist() for x in corners)
+            found["box"].append({"name": f"{_table_name(path)}{number}", "low": lowest, "high": highest})
+        else:
+            found["shape"] += [_shape_table(c) for c in capsules]
+    if not parts:
+        raise UsageError(f"{path}: holds no triangles")
+    return found
+
+
+def _table_name(path: Path) -> str:
+    """Return a file's name as a name in a machine file."""
+    name = "".join(c if c.isalnum() and c.isascii() else "_" for c in path.stem.lower())
+    return name if name[:1].isalpha() else f"mesh_{name}"
 
 
 def _shape_table(capsule: Capsule) -> dict[str, Any]:

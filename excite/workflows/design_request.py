@@ -20,9 +20,11 @@ from excite.errors import InfeasibleError, MachineError, SolverError, UsageError
 from excite.model import Model, build, effects, hidden_zeros, with_given_zeros
 from excite.model.machine import EffectEntry, Problem, Quantity
 from excite.operator import PhasedDrive
-from excite.trajectories import AccuracyBound, CompositeObjective, Design, Manoeuvre, design
+from excite.simulation import Motion
+from excite.trajectories import AccuracyBound, CompositeObjective, Design, Manoeuvre, design_drive
+from excite.workflows import requests
+from excite.workflows.payload_design import loaded_machines, payload_contrasts, payload_summary
 
-DEFAULT_TRAJECTORY = "free"  # of an arm
 ASSUMED_TORQUE_NOISE = 0.005  # of the torque limit, standard deviation, without a figure of the sensor; chosen
 ASSUMED_COUNTS_PER_TURN = 65536.0  # of an encoder without a figure; chosen
 # Objectives with a bound, as functions of the relative standard deviations [%].
@@ -50,6 +52,7 @@ class DesignRequest:
     between: two effects or more, NAME[@WHERE]=MAGNITUDE, that the drive must separate.
     trajectory: kind of joint motion of an arm, a name of `TRAJECTORIES`; None for the usual one, or torques of others.
     of: profile (.csv) or design folder of the drive to predict, for the objectives of a prediction.
+    payload_kg [kg]: of an arm, design for the payload's parameters, from drives without and with it.
     other_end: with objective cond, also find the drive for accuracy alone, to compare with.
     driver: design for people, in phases of phase_min_s [s] or more.
     cond_slack [%]: with objective cond, by how much cond(Phi) may grow for the most accurate drive; 0 for the lowest.
@@ -71,11 +74,12 @@ class DesignRequest:
     of: Path | None = None
     trajectory: str | None = None
     other_end: bool = True
+    payload_kg: float | None = None
 
     @property
     def second_step(self) -> bool:
         """True if the drive of lowest cond(Phi) is made more accurate within `cond_slack`."""
-        plain = self.sigma_max is None and not (self.robust or self.between or self.driver)
+        plain = self.sigma_max is None and not (self.robust or self.between or self.driver or self.payload_kg)
         return self.objective == "cond" and self.cond_slack > 0 and plain
 
 
@@ -146,8 +150,14 @@ def with_earlier_logs(model: Model, after: Sequence[Path]) -> tuple[Model, np.nd
     """Return the model with the estimate from logs as nominal values, and their information [1/SI^2], None without."""
     if not after:
         return model, None
-    ready = logs.prepare(model, list(after), identification.needed_sensors(model, "joint"))
-    known = identification.prior_from_logs(ready.model, ready.logs)
+    if model.follows_positions:
+        method = identification.recommend_method(model)
+        ready = logs.prepare(model, list(after), identification.needed_sensors(model, method))
+        estimate = identification.identify(ready.model, ready.logs, method)
+        known = identification.prior_from_estimate(ready.model, estimate)
+    else:
+        ready = logs.prepare(model, list(after), identification.needed_sensors(model, "joint"))
+        known = identification.prior_from_logs(ready.model, ready.logs)
     return replace(known.model, machine=model.machine), known.information
 
 
@@ -155,6 +165,8 @@ def contrasts(model: Model, request: DesignRequest) -> np.ndarray | None:
     """Return what the objective judges (n_base, m), None for each parameter or effect. Raises LogError."""
     if request.between:
         return trajectories.rival_contrasts(model, [e.name for e in model.effects[-len(request.between) :]])
+    if request.payload_kg is not None:
+        return payload_contrasts(model, request.payload_kg)
     if request.of is None:
         return None
     drive = logs.read_drive(request.of, model)
@@ -183,8 +195,18 @@ def _design(
     model: Model, problem: Problem, request: DesignRequest, progress: Callable[[int, int, float], None] | None
 ) -> DesignResult:
     """Design a drive for a model all of whose encoder zeros show in it; errors as of `design_from`."""
-    if request.trajectory is not None or model.follows_positions:
-        return _design_arm(model, problem, request, progress)
+    request = check_arm_options(model, request)
+    model, assumed = with_assumed_noise(model)
+    found = _design_with_noise(model, problem, request, progress)
+    if model.follows_positions and not found.design.cond_phi < SINGULAR_COND:
+        raise np.linalg.LinAlgError(f"cond(Phi) {found.design.cond_phi:g}")
+    return replace(found, assumed_noise=assumed)
+
+
+def _design_with_noise(
+    model: Model, problem: Problem, request: DesignRequest, progress: Callable[[int, int, float], None] | None
+) -> DesignResult:
+    """Design a drive for a machine whose sensors have noise figures; errors as of `design_from`."""
     if request.driver:
         operator.check_phase_length(model, problem, request.phase_min_s)
     require_noise_figures(model)
@@ -194,17 +216,29 @@ def _design(
         simulation.perturbed_machines(model, ROBUST_MACHINES, ROBUST_SPREAD, request.seed) if request.robust else ()
     )
     aim = trajectories.compose_objective(model, request.objective, request.sigma_max, prior, machines, None, judged)
+    if request.payload_kg is not None:
+        aim = replace(aim, machines=loaded_machines(model, request.payload_kg))
     if not request.driver:
         budget = request.budget_s if not request.second_step or request.budget_s is None else request.budget_s / 2
         until = None if request.budget_s is None else time.time() + request.budget_s
-        lowest = design(model, problem, aim, request.starts, request.seed, budget, progress, solver=request.solver)
+        lowest = design_drive(
+            model,
+            problem,
+            aim,
+            request.starts,
+            request.seed,
+            budget,
+            progress,
+            solver=request.solver,
+            trajectory=request.trajectory,
+        )
         if not request.second_step:
             bound = _bound_on_objective(model, problem, request) if lowest.complete else None
             return DesignResult(model, aim, lowest, contrasts=judged, bound=bound)
         return _make_accurate(model, problem, request, aim, lowest, prior, until)
     begin = time.time()
     half = None if request.budget_s is None else request.budget_s / 2
-    free = design(model, problem, aim, request.starts, request.seed, half, progress, solver=request.solver)
+    free = design_drive(model, problem, aim, request.starts, request.seed, half, progress, solver=request.solver)
 
     def out_of_time() -> bool:
         return request.budget_s is not None and time.time() > begin + request.budget_s
@@ -215,31 +249,39 @@ def _design(
     return DesignResult(model, aim, operator.as_design(model, problem, free, made), made, contrasts=judged)
 
 
-def _design_arm(
-    model: Model, problem: Problem, request: DesignRequest, progress: Callable[[int, int, float], None] | None
-) -> DesignResult:
-    """Design the joint motion of an arm. Raises UsageError for options of torque profiles, else as `design_from`."""
-    trajectory = request.trajectory or DEFAULT_TRAJECTORY
-    trajectories.check_joint_motion(model, trajectory)
+PAYLOAD_OBJECTIVE = "accuracy"  # of a payload, where none is asked for
+
+
+def check_arm_options(model: Model, request: DesignRequest) -> DesignRequest:
+    """Return a request with the objective that a payload needs.
+
+    Raises UsageError for options that are not for an arm, or not for a payload; MachineError for options of arms with
+    another machine.
+    """
+    if not model.follows_positions:
+        if request.trajectory is not None:
+            trajectories.check_joint_motion(model, request.trajectory)
+        if request.payload_kg is not None:
+            payload_contrasts(model, request.payload_kg)
+        return request
     for option, given in (
         ("--driver", request.driver),
-        ("--robust", request.robust),
         ("--between", bool(request.between)),
-        ("--of", request.of is not None),
         (f"--solver {request.solver}", request.solver != "own"),
     ):
         if given:
             raise UsageError(f"{option}: not for {model.machine.name}, an arm, whose designs are motions of its joints")
-    model, assumed = with_assumed_noise(model)
-    require_noise_figures(model)
-    model, prior = with_earlier_logs(model, request.after)
-    aim = trajectories.compose_objective(model, request.objective, request.sigma_max, prior)
-    found = trajectories.design_joint_motion(
-        model, problem, aim, request.starts, request.seed, request.budget_s, progress, trajectory
-    )
-    if not found.cond_phi < SINGULAR_COND:
-        raise np.linalg.LinAlgError(f"cond(Phi) {found.cond_phi:g}")
-    return DesignResult(model, aim, found, assumed_noise=assumed)
+    if request.payload_kg is None:
+        return request
+    requests.require_positive("--payload", request.payload_kg, "kg")
+    if request.robust or request.after or request.sigma_max is not None or request.of is not None:
+        raise UsageError("--payload: does not go with --robust, --after, --sigma-max or --of")
+    objective = PAYLOAD_OBJECTIVE if request.objective == "cond" else request.objective
+    chosen = trajectories.OBJECTIVES[objective]
+    if chosen.of != "variances" or chosen.contrasts != "parameters":
+        allowed = [n for n, o in trajectories.OBJECTIVES.items() if (o.of, o.contrasts) == ("variances", "parameters")]
+        raise UsageError(f"--payload: needs an --objective of accuracy: {', '.join(allowed)} (got {objective})")
+    return replace(request, objective=objective)
 
 
 def without_hidden_zeros(model: Model) -> tuple[Model, tuple[str, ...]]:
@@ -285,7 +327,7 @@ class _NearSearch:
     def find(
         self,
         objective: str,
-        warm: Sequence[Manoeuvre],
+        warm: Sequence[Manoeuvre | Motion],
         share: float,
         sigma_max: float | None = None,
         cond_max: float | None = None,
@@ -300,13 +342,25 @@ class _NearSearch:
         aim = trajectories.compose_objective(self.model, objective, sigma_max, self.prior, cond_max=cond_max)
         request = self.request
         try:
-            return design(self.model, self.problem, aim, 0, request.seed, left, None, warm, request.solver)
+            return design_drive(
+                self.model,
+                self.problem,
+                aim,
+                0,
+                request.seed,
+                left,
+                None,
+                warm,
+                request.solver,
+                request.trajectory,
+            )
         except (InfeasibleError, SolverError):
             return None
 
-    def worst(self, drive: Manoeuvre) -> float:
+    def worst(self, drive: Manoeuvre | Motion) -> float:
         """Return the attainable standard deviation [%] of the worst parameter along a drive."""
-        motion = simulation.simulate(self.model, drive.sample(float(self.model.machine.sampling_hz)))
+        rate = float(self.model.machine.sampling_hz)
+        motion = drive if isinstance(drive, Motion) else simulation.simulate(self.model, drive.sample(rate))
         aim = trajectories.compose_objective(self.model, "cond", prior=self.prior)
         return float(trajectories.sigma_percent(aim, self.model, motion).max())
 
@@ -329,13 +383,14 @@ def _make_accurate(
     found, ends = lowest, DesignResult(model, aim, lowest)
     try:
         cond_max = (1 + request.cond_slack / 100) * lowest.cond_phi
-        found = search.find("worst", [lowest.manoeuvre], 0.5, cond_max=cond_max) or lowest
+        found = search.find("worst", [lowest.drive], 0.5, cond_max=cond_max) or lowest
         reached = {k: search.worst(drive) for k, drive in enumerate(lowest.random)}
         best = min(reached, key=lambda k: reached[k], default=None)
-        if best is not None and search.worst(found.manoeuvre) > reached[best]:
-            warm = [found.manoeuvre, lowest.random[best]]
+        if best is not None and search.worst(found.drive) > reached[best]:
+            warm = [found.drive, lowest.random[best]]
             found = search.find("cond", warm, 0.5, sigma_max=reached[best]) or found
-        accurate = search.find("accuracy", [found.manoeuvre], 1.0) if request.other_end else None
+        other_end = request.other_end and not model.follows_positions  # a minute more, for an arm
+        accurate = search.find("accuracy", [found.drive], 1.0) if other_end else None
         ends = replace(ends, accurate=accurate, random_percent=None if best is None else reached[best])
     except KeyboardInterrupt:
         lowest = replace(lowest, complete=False)
@@ -379,6 +434,7 @@ def _bound_summary(result: DesignResult, bound: AccuracyBound) -> dict[str, Any]
 def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, Any]:
     """Summarise a design: request, scores, attainable accuracy, limits."""
     names, drive = result.model.base.names, result.design
+    request = replace(request, objective=result.aim.name)
     sigma = dict(zip(names, trajectories.sigma_percent(result.aim, result.model, drive.motion).tolist(), strict=True))
     worst = max(sigma, key=lambda n: sigma[n])
     summary: dict[str, Any] = {
@@ -416,6 +472,8 @@ def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, 
         summary["random_start_percent"] = result.random_percent
     if result.assumed_noise:
         summary["assumed_noise"] = list(result.assumed_noise)
+    if request.payload_kg is not None:
+        summary["payload"] = payload_summary(result.model, request.payload_kg, [drive.motion])
     if result.given_zeros:
         summary["given_zeros"] = list(result.given_zeros)
     if result.bound is not None:

@@ -103,6 +103,7 @@ def design_account(found: DesignResult, name: str, problem: Problem, request: De
         },
         partial(reports.drive_frame, model, found.design.motion),
         (partial(write_drive, model, found.design.motion),),
+        scene=partial(reports.motion_scene, model, found.design.motion) if model.follows_positions else None,
     )
 
 

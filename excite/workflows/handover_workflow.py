@@ -69,7 +69,8 @@ def hand_over(
     }
     told = [words[0], "", *(f"- {line}" for line in words[1:]), ""]
     (place / "rehearsal.md").write_text("\n".join(["# Rehearsal", "", *told]), encoding="utf-8")
-    reports.write_report(place, "handover", summary, None, {})
+    written["motion.html"] = "the motion to look at, in a browser"
+    reports.write_report(place, "handover", summary, None, {}, reports.motion_scene(model, motion))
     return summary
 
 

@@ -193,8 +193,8 @@ def test_only_arms_have_joint_motions(arm: Model) -> None:
     with pytest.raises(MachineError, match="leave out --trajectory"):
         design_from(model, problem, DesignRequest(trajectory="fourier"))
     problem = choose_problem(arm.machine, None, None)[1]
-    with pytest.raises(UsageError, match="--robust: not for two_joints"):
-        design_from(arm, problem, DesignRequest(robust=True))
+    with pytest.raises(UsageError, match="--driver: not for two_joints"):
+        design_from(arm, problem, DesignRequest(driver=True))
 
 
 def test_arm_without_problem_and_noise_figures_is_designed(arm: Model) -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
+import pytest
+from support.commands import Excite
 
 from excite.cli import machine_template
 from excite.model import build
@@ -102,3 +105,27 @@ def test_a_mesh_that_is_missing_is_said_in_the_file(tmp_path: Path) -> None:
     machine_template.start("arm", file, origin=str(urdf))
     assert "the collision mesh package://robots/nothing.stl is not there" in file.read_text()
     assert not any(b.shape for b in load_machine(file).body)
+
+
+def test_meshes_around_an_arm_become_boxes_and_capsules_that_hold_them(tmp_path: Path, excite: Excite) -> None:
+    """A table in millimetres and a slanted pipe beside it, shifted; the lines printed are those of a machine file."""
+    import trimesh
+
+    slab = trimesh.creation.box((800, 600, 40))
+    pipe = trimesh.creation.cylinder(30, segment=((900, 0, 0), (1300, 300, 900)))
+    trimesh.util.concatenate([slab, pipe]).export(tmp_path / "cell.stl")
+    code, text, said = excite("machine", "around", tmp_path / "cell.stl", "--unit", "0.001", "--at", "0.5,0,-0.1")
+    assert code == 0, said
+    world = tomllib.loads(text)["world"]
+    assert [box["name"] for box in world["box"]] == ["cell"]
+    assert world["box"][0]["low"] == pytest.approx([0.1, -0.3, -0.12], abs=2e-4)
+    assert world["box"][0]["high"] == pytest.approx([0.9, 0.3, -0.08], abs=2e-4)
+    shapes = [(np.array(s["ends"], float), s["radius"]["value"]) for s in world["shape"]]
+    assert inside(pipe.vertices * 1e-3 + [0.5, 0, -0.1], shapes).min() > 0
+    assert sum(radius for _, radius in shapes) < 0.15, "no more room than the pipe needs"
+    plain = ARM.with_name("two_joints.toml").read_text()
+    (tmp_path / "arm.toml").write_text(f"{plain}\n{text}")
+    assert load_machine(str(tmp_path / "arm.toml")).world.box[0].name == "cell"
+    (tmp_path / "no.stl").write_text("nothing")
+    code, _, said = excite("machine", "around", tmp_path / "no.stl")
+    assert (code, "no.stl: " in said) == (2, True)
