@@ -24,6 +24,7 @@ from excite.errors import DiskError, FolderError
 
 SUMMARY = "summary.json"
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # what the user can mend, and no defect of the program
+MOST_DIGITS = 300  # of an integer: floats end at 1.8e308
 REQUEST_KEYS = (
     "objective",
     "duration_s",
@@ -98,6 +99,26 @@ def check_out_folder(out: Path, inputs: Iterable[Path] = (), option: str = "--ou
     _check_writable(out)
 
 
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file. Raises OSError, ValueError as `parse_json`."""
+    return parse_json(path.read_text(encoding="utf-8"))
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return the content of a JSON text. Raises ValueError, also for deep nesting and integers beyond any float."""
+    try:
+        return json.loads(text, parse_int=_integer)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def _integer(digits: str) -> int:
+    """Read an integer that a float can hold. Raises ValueError."""
+    if len(digits) > MOST_DIGITS:
+        raise ValueError(f"an integer of {len(digits)} digits")
+    return int(digits)
+
+
 def describe_result(out: Path) -> str | None:
     """Return the date of the result in a folder, and its settings if its summary has them; None for no result."""
     path = out / SUMMARY
@@ -105,8 +126,8 @@ def describe_result(out: Path) -> str | None:
         return None
     made = f"{datetime.fromtimestamp(path.stat().st_mtime):%Y-%m-%d %H:%M}"
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        found = read_json(path)
+    except (OSError, ValueError):
         return made
     if isinstance(found, dict) and isinstance(found.get("design"), dict):  # written by `excite run`
         found = found["design"]

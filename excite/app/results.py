@@ -92,9 +92,9 @@ def read_result(folder: Path, time: float) -> Result | str | None:
             return f"{path}: is no file"
         if path.stat().st_size > MAX_BYTES:
             return f"{path}: is too large for a summary"
-        summary = json.loads(path.read_text(encoding="utf-8"))
+        summary = output.read_json(path)
         json.dumps(summary, ensure_ascii=False).encode()  # half a surrogate pair can't be sent to the page
-    except (OSError, ValueError, RecursionError) as err:
+    except (OSError, ValueError) as err:
         said = err.strerror if isinstance(err, OSError) else "no JSON"
         return f"{path}: can't be read: {said}"
     if not isinstance(summary, dict):

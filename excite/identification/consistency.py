@@ -110,16 +110,16 @@ def _nearest(model: Model, estimate: Estimate) -> tuple[np.ndarray, float, np.nd
     cost = cp.sum_squares(_inverse_root(covariance) @ shift)
     problem = cp.Problem(cp.Minimize(cost), _possibility_constraints(model, by_name, INTERIOR_MARGIN))
     if not _solved(problem) or X.value is None:
-        raise NotConsistentError(f"no possible machine found near the estimate: the solver says {problem.status}")
+        raise NotConsistentError("no possible machine found near the estimate")
     return kept, float(np.sqrt(max(cost.value, 0.0))), np.asarray(X.value)
 
 
-def _solved(problem: cp.Problem) -> bool:
+def _solved(problem: cp.Problem, tolerance: float = 1e-10) -> bool:
     """Solve a convex program; return whether it has a solution."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of an inaccurate solution, which the status tells as well
-            problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
+            problem.solve(solver=cp.CLARABEL, tol_gap_abs=tolerance, tol_gap_rel=tolerance, tol_feas=tolerance)
     except cp.error.SolverError:
         return False
     return problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
@@ -130,8 +130,7 @@ def is_possible(model: Model, X: np.ndarray) -> bool:
     _, by_name, base = _variables(model)
     equality = (base - X) / model.scale == 0
     problem = cp.Problem(cp.Minimize(0), [equality, *_possibility_constraints(model, by_name, 0.0)])
-    problem.solve(solver=cp.CLARABEL)
-    return problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
+    return _solved(problem, tolerance=1e-8)
 
 
 def _variables(model: Model) -> tuple[cp.Variable, dict[str, cp.Expression], cp.Expression]:

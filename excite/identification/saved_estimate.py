@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -54,7 +53,7 @@ def read_estimate(folder: Path) -> SavedEstimate:
             f"{folder}: not an estimate (no {output.SUMMARY} in it), give a folder of `excite identify`"
         )
     try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
+        summary = output.read_json(path)
     except (OSError, ValueError):
         raise EstimateFolderError(f"{path}: damaged or not readable, {AGAIN}") from None
     if not isinstance(summary, dict) or not {"status", "parameters", "cond_phi"} <= set(summary):
@@ -70,9 +69,14 @@ def read_estimate(folder: Path) -> SavedEstimate:
         if (folder / TOLERANCES).is_file():
             shifts = pd.read_csv(folder / TOLERANCES, index_col="source")
             by_source = dict(zip(shifts.index, shifts[list(estimate.names)].to_numpy(float), strict=True))
+            variances = np.square([x[np.isfinite(estimate.value)] for x in by_source.values()])
+            if not np.isfinite(variances).all():
+                raise ValueError("shifts that are no numbers")
             estimate = replace(estimate, tolerated=by_source)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        raise EstimateFolderError(f"{folder}: {output.SUMMARY} or {COVARIANCE} is damaged, {AGAIN}") from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError):
+        raise EstimateFolderError(
+            f"{folder}: {output.SUMMARY}, {COVARIANCE} or {TOLERANCES} is damaged, {AGAIN}"
+        ) from None
     if estimate.names != model.base.names:
         raise EstimateFolderError(f"{folder}: {MACHINE} has other parameters than {output.SUMMARY}, {AGAIN}")
     return SavedEstimate(summary, model, estimate)
@@ -85,17 +89,25 @@ def _estimate(summary: dict[str, Any], covariance: pd.DataFrame) -> Estimate:
     if tuple(covariance.columns) != names or tuple(covariance.index) != names:
         raise ValueError("names differ")
     spread = covariance.to_numpy(float)
-    std = np.sqrt(np.diag(spread))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        skew = np.abs(spread - spread.T) / np.outer(std, std)
-    if np.isinf(spread).any() or (np.isnan(spread) != np.isnan(spread.T)).any() or (skew > MOST_SKEW).any():
+    value = np.array([r["value"] for r in rows.values()], float)
+    known = np.isfinite(value)
+    if not (np.isfinite(spread) == np.outer(known, known)).all():
+        raise ValueError("no covariance of these values")
+    variance = np.diag(spread)[known]
+    if (variance < 0).any():
+        raise ValueError("variances below zero")
+    std = np.sqrt(np.where(variance > 0, variance, 1.0))
+    correlation = spread[np.ix_(known, known)] / np.outer(std, std)
+    if (np.abs(correlation - correlation.T) > MOST_SKEW).any():
         raise ValueError("no covariance")
     spread = (spread + spread.T) / 2
+    if np.linalg.eigvalsh((correlation + correlation.T) / 2).min(initial=0.0) < -MOST_SKEW:
+        raise ValueError("variances of sums below zero")
     return Estimate(
         str(summary["method"]),
         names,
         tuple(str(r["unit"]) for r in rows.values()),
-        np.array([r["value"] for r in rows.values()], float),
+        value,
         spread,
         float(summary["cond_w"]),
         float(summary["cond_phi"]),

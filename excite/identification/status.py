@@ -37,6 +37,7 @@ UNIT_FACTORS = (
     (180 / math.pi, 2, 0.1, "is an angle in degrees where the machine file says radians, or the reverse?"),
     (30 / math.pi, 2, 0.03, "is a speed in rpm where the machine file says rad/s, or the reverse?"),
 )
+BEYOND_CHANCE = 100.0  # factor at which no two values are by chance, however small they are; chosen
 LEAST_GEAR = 2.0  # ratio from whose square on values off by it are no chance; chosen
 SQUARE_TOLERANCE = 0.2  # relative deviation of values from the square of a gear ratio; chosen
 STANDS = 0.01  # share of a joint's largest speed below which it stands; chosen
@@ -160,12 +161,13 @@ def _contradiction(model: Model, estimate: Estimate) -> str:
 def _unit_suspicion(model: Model, estimate: Estimate) -> str:
     """Say which values are off the machine file's by the factor between two units, "" if none is.
 
-    Values that the file gives as zero, or nearly so among those in the same unit, and offsets say nothing of units.
+    Values that the file gives as zero, or nearly so among those in the same unit, and offsets say nothing of units;
+    those too small for the motion to show only of a factor beyond chance.
     """
     nominal, names = np.abs(model.nominal), np.array(model.base.names)
     units = np.array(model.base.units)
     largest = np.array([nominal[units == unit].max() for unit in units])
-    comparable = np.isfinite(estimate.value) & (nominal > MIN_NOMINAL_SHARE * largest) & (nominal >= model.scale)
+    comparable = np.isfinite(estimate.value) & (nominal > MIN_NOMINAL_SHARE * largest)
     comparable &= np.abs(model.offsets).sum(axis=0) == 0
     comparable &= ~np.isin(names, [n for e in model.effects for n in e.parameters])
     clear = comparable & (np.abs(estimate.value - model.nominal) > CLEAR_STDS * estimate.std_total)
@@ -179,7 +181,8 @@ def _unit_suspicion(model: Model, estimate: Estimate) -> str:
     ]
     for factor, least, tolerance, question in (*squares, *(UNIT_FACTORS if turns else UNIT_FACTORS[:1])):
         for one in (factor, 1 / factor):
-            off = names[clear & (np.abs(ratio / one - 1) < tolerance)]
+            sizeable = (nominal >= model.scale) | (factor > BEYOND_CHANCE and least > 1)
+            off = names[clear & sizeable & (np.abs(ratio / one - 1) < tolerance)]
             if len(off) >= least:
                 times = f"{format_number(factor, 3)} times {'above' if one > 1 else 'below'}"
                 verb = "is" if len(off) == 1 else "are"

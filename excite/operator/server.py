@@ -25,7 +25,7 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from excite import interrupt
+from excite import interrupt, output
 from excite.errors import ServeError
 from excite.model.machine import UNITS, Machine
 from excite.operator.ground import Lever
@@ -129,7 +129,7 @@ def reachable_addresses(host: str) -> list[str]:
 def parse_message(message: str | bytes, keys: Sequence[str]) -> dict[str, float] | None:
     """Parse a message into numbers by known keys, the speed among them; None for anything else."""
     try:
-        said = json.loads(message)
+        said = output.parse_json(message)
     except ValueError:
         return None
     if not isinstance(said, dict) or SPEED not in said or set(said) - set(keys):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -50,7 +49,7 @@ def read_design_summary(design_dir: Path) -> dict[str, Any]:
             f"{design_dir}: not a design (no {output.SUMMARY} in it), make one with `excite design MACHINE`"
         )
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = output.read_json(path)
     except (OSError, ValueError):
         raise DesignFolderError(f"{path}: damaged or not readable, design again") from None
     whole = isinstance(found, dict) and isinstance(found.get("machine"), str) and "duration_s" in found

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import json
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -96,7 +95,7 @@ def _finished_summary(out: Path, fingerprint: str) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = output.read_json(path)
     except (OSError, ValueError):
         return None
     if not isinstance(found, dict) or "fingerprint" not in found:
@@ -182,7 +181,7 @@ def _stored_drive(plan: StudyPlan, folder: Path, number: int) -> StoredDrive:
         b"" if expected is None else np.array(expected, float).tobytes(),
     )
     path = folder / _drive_name(number) / output.SUMMARY
-    summary = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    summary = output.read_json(path) if path.is_file() else {}
     return StoredDrive(stored, (len(torque) - 1) / float(model.machine.sampling_hz), summary)
 
 

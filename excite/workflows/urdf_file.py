@@ -238,6 +238,8 @@ def read(path: Path) -> Urdf:
 
 def _base(reader: _Reader, links: dict[str, Inertial | None], joints: Sequence[Joint]) -> str:
     """Return the one link without a joint above it."""
+    if not links:
+        reader.refuse("has no links; a xacro file must be expanded first")
     children = [j.child for j in joints]
     for joint in joints:
         if children.count(joint.child) > 1:

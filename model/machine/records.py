@@ -16,6 +16,8 @@ from excite.text import did_you_mean
 
 MOST_BYTES = 5_000_000  # of a TOML file; those of machines have 20 kB; chosen
 MOST_ENTRIES = 50_000  # keys and elements of lists in it; chosen
+LONGEST_KEY, LONGEST_TEXT = 200, 10_000  # characters; chosen
+MOST_BITS = 14_000  # of an integer: what Python prints has 4300 digits at most
 MOST_SAID = 100  # faults of a file that are listed; chosen
 
 Source = Literal["paper", "data sheet", "measured", "published", "identified", "assumed", "definition"]
@@ -33,14 +35,25 @@ def read_toml(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError as err:
         line = err.object.count(b"\n", 0, err.start) + 1
         raise ValueError(f"{path}: not a TOML file: line {line} is not UTF-8; save it as UTF-8") from None
-    except (ValueError, RecursionError) as err:  # also an integer of thousands of digits
-        raise ValueError(f"{path}: not a TOML file: {err}") from None
+    except RecursionError:
+        raise ValueError(f"{path}: not a TOML file: lists or tables are nested too deeply") from None
+    except ValueError as err:
+        fault = "holds an integer of thousands of digits" if "integer string conversion" in str(err) else err
+        raise ValueError(f"{path}: not a TOML file: {fault}") from None
     except OSError as err:
         raise ValueError(f"{path}: can't be read: {err.strerror}") from None
 
 
 def _entries(value: Any) -> int:
-    """Count the keys and elements of nested tables and lists."""
+    """Count the keys and elements of nested tables and lists. Raises ValueError for a value of absurd length."""
+    if isinstance(value, int) and value.bit_length() > MOST_BITS:
+        raise ValueError(f"holds an integer of {value.bit_length()} bits")
+    if isinstance(value, str) and len(value) > LONGEST_TEXT:
+        raise ValueError(f"{value[:20]!r}... is a text of {len(value)} characters, at most {LONGEST_TEXT}")
+    if isinstance(value, dict):
+        long = next((key for key in value if len(key) > LONGEST_KEY), None)
+        if long is not None:
+            raise ValueError(f"{long[:20]!r}... is a key of {len(long)} characters, at most {LONGEST_KEY}")
     inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     return len(inside) + sum(map(_entries, inside))
 

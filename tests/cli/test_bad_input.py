@@ -37,6 +37,7 @@ from support.commands import Excite
 from excite import workflows
 from excite.errors import (
     DesignFolderError,
+    EstimateFolderError,
     InfeasibleError,
     LogError,
     MachineError,
@@ -44,7 +45,7 @@ from excite.errors import (
     SimulationError,
     StudyError,
 )
-from excite.identification import methods
+from excite.identification import methods, saved_estimate
 from excite.logs import inspection, log, profile as profiles, tables
 from excite.model import Model, prediction
 from excite.model.effects import placing
@@ -63,6 +64,7 @@ INPUTS = {  # mutated inputs: how many in the fast suite (seeds from 1) and in t
     "command lines": (40, 200, 1000),
     "command lines as processes": (0, 15, 50_000),
     "design folders": (20, 150, 1000),
+    "estimates": (20, 150, 1000),
 }
 PATIENCE = 120.0  # s for one input, on a machine that is busy
 LONGEST = 800  # characters of a message
@@ -215,7 +217,7 @@ def spoilt_toml(text: str, rng: random.Random) -> bytes:
 
 def spoilt_json(data: bytes, rng: random.Random) -> bytes:
     """A value that is of another kind or size."""
-    values = ("null", "-1", "1e999", "NaN", '"x"', "[]", "{}", "true", "0")
+    values = ("null", "-1", "1e999", "NaN", '"x"', "[]", "{}", "true", "0", "9" * 400, "[" * 100_000)
     parts = data.decode().split(":")
     at = rng.randrange(1, len(parts))
     value, comma, rest = parts[at].partition(",")
@@ -455,6 +457,36 @@ def test_design_folders(ground: dict[str, Any], tmp_path: Path, count: int, seed
                 told["refused"] += 1
     show("design folders", told, count, seed, faults)
     assert told["refused"] > count / 10
+
+
+@many("estimates")
+def test_estimates(ground: dict[str, Any], tmp_path: Path, count: int, seed: int) -> None:
+    """A spoilt folder of an estimate is refused in a line, or predicts finite numbers with finite bands."""
+    told: Told = Counter()
+    faults: list[str] = []
+    names = ("summary.json", "machine.json", "covariance.csv", "tolerances.csv")
+    for k in range(count):
+        rng = random.Random(seed + k)
+        for name in names:
+            (tmp_path / name).write_bytes((ground["found"] / name).read_bytes())
+        name = rng.choice(names)
+        good = (tmp_path / name).read_bytes()
+        spoil = spoilt_json if name.endswith("json") else lambda data, rng: spoilt_csv(data.decode(), rng)
+        spoil = spoil if rng.random() < 0.8 else spoilt
+        (tmp_path / name).write_bytes(changed(good, partial(spoil, good), rng))
+        with patience(f"estimate {seed + k}", faults), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                found = saved_estimate.read_estimate(tmp_path)
+            except EstimateFolderError as err:
+                one_line(err)
+                told["refused"] += 1
+            else:
+                assert np.isfinite(found.estimate.value).all()
+                assert np.isfinite(found.estimate.std_total).all()
+                told["read"] += 1
+    show("estimates", told, count, seed, faults)
+    assert min(told["refused"], told["read"]) > count / 20
 
 
 WORDS = [
@@ -738,6 +770,11 @@ def test_a_message_is_numbers_or_is_refused(message: Any) -> None:
     if said is not None:
         assert set(said) <= set(KEYS)
         assert all(isinstance(v, float) and math.isfinite(v) for v in said.values())
+
+
+@pytest.mark.parametrize("value", ["9" * 400, "[" * 100_000, "1e999", "NaN"], ids=["long", "deep", "inf", "nan"])
+def test_a_message_that_no_number_holds_is_refused(value: str) -> None:
+    assert server.parse_message(f'{{"{server.TIME}": 0, "{server.SPEED}": {value}}}', KEYS) is None
 
 
 @settings(max_examples=25, derandomize=True)

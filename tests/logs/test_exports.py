@@ -30,8 +30,16 @@ from excite.logs import FORMATS, read_table
 @pytest.mark.parametrize("x", ["One", "Multi", "No"])
 @pytest.mark.parametrize(
     "options",
-    [{}, {"comma": ","}, {"separator": "Semicolon", "comma": ","}, {"separator": "Comma"}, {"segments": 3}],
-    ids=["tabs", "decimal comma", "semicolons", "commas", "segments"],
+    [
+        {},
+        {"comma": ","},
+        {"comma": ",", "comma_said": False},
+        {"separator": "Semicolon", "comma": ","},
+        {"separator": "Comma"},
+        {"separator": "Comma", "comma_said": False},
+        {"segments": 3},
+    ],
+    ids=["tabs", "decimal comma", "comma unsaid", "semicolons", "commas", "point unsaid", "segments"],
 )
 def test_labview_measurement_files(name: str, x: str, options: dict[str, object], tmp_path: Path) -> None:
     table = read_table(write_lvm(tmp_path / name, x, **options))  # type: ignore[arg-type]
@@ -64,10 +72,12 @@ def test_what_the_scope_adds_is_said(tmp_path: Path) -> None:
     assert "offset of Axis.Torque 2" in read_table(write_scope(tmp_path / "log.csv", offset=2)).attrs["notes"][0]
 
 
-@pytest.mark.parametrize("style", ["-l", "-t a", "-t a -x", "FD"])
-def test_candump(style: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("head", ["", "recorded on the rig\n(1.5) can0 10"], ids=["", "torn"])
+@pytest.mark.parametrize("style", ["-l", "FD", "-t a", "-t a -x", "-t A", "-t d", "-t a -i", "-t a -S"])
+def test_candump(style: str, head: str, tmp_path: Path) -> None:
+    """Times absolute, with dates, or since the frame before (-t d); bytes in hex, as bits (-i) or reversed (-S)."""
     write_can(tmp_path, ".asc")  # with its DBC
-    table = read_table(write_candump(tmp_path / "log.log", style), ["Encoder.Angle", "Motor.Torque"])
+    table = read_table(write_candump(tmp_path / "log.log", style, head), ["Encoder.Angle", "Motor.Torque"])
     for name, at, values, step in (("Encoder.Angle", T, ANGLE, 1e-6), ("Motor.Torque", T_TORQUE, TORQUE, 1e-2)):
         there = table[name].notna().to_numpy()
         assert table["timestamps"].to_numpy()[there] == pytest.approx(at, abs=2e-6)
@@ -79,6 +89,15 @@ def test_candump_without_times_says_how_to_record_them(tmp_path: Path) -> None:
     (tmp_path / "log.log").write_text("  can0  100   [8]  00 00 00 00 00 00 00 00\n")
     with pytest.raises(LogError, match="without times: record with `candump -l`"):
         read_table(tmp_path / "log.log")
+
+
+def test_frames_with_fewer_bytes_than_they_say_are_left_out(tmp_path: Path) -> None:
+    write_can(tmp_path, ".asc")
+    path = write_candump(tmp_path / "log.log", "-t a")
+    path.write_text(path.read_text().replace("[8]  00 00 00 00 01", "[8]  00 00 00 01", 1))
+    table = read_table(path, ["Encoder.Angle"])
+    assert len(table) == len(T) - 1
+    assert "1 line is no frame" in table.attrs["notes"][0]
 
 
 def test_a_log_of_text_may_end_in_log(tmp_path: Path) -> None:

@@ -687,7 +687,11 @@ def test_a_machine_is_also_built_from_data() -> None:
     [
         (lambda text: "".join(f"k{k} = 1\n" for k in range(60_000)) + text, "holds more than 50000 keys"),
         (lambda text: "".join(f"k{k} = 1\n" for k in range(500)) + text, r"no such key here.*\(and 499 more\)"),
-        (lambda text: text + "\nreference_number = " + "9" * 5000, "not a TOML file: Exceeds the limit"),
+        (lambda text: text + "\nreference_number = " + "9" * 5000, "holds an integer of thousands of digits"),
+        (lambda text: text + "\nreference_number = 0x" + "f" * 5000, "holds an integer of 20000 bits"),
+        (lambda text: text + f"\n{'k' * 5000} = 1", "is a key of 5000 characters, at most 200"),
+        (lambda text: text + f'\ntitle = "{"x" * 20_000}"', "is a text of 20000 characters"),
+        (lambda text: text + "\nx = " + "[" * 3000 + "]" * 3000, "are nested too deeply"),
         (lambda text: "sampling_hz = { value = " + "9" * 4000 + ', source = "assumed" }\n' + text, "size between"),
     ],
 )

@@ -112,30 +112,44 @@ def write_can(path: Path, suffix: str) -> Path:
     return path / f"log{suffix}"
 
 
-def write_candump(path: Path, style: str = "-l") -> Path:
-    """Frames as candump writes them: its log file, what it shows with times, or frames of CAN FD."""
+def write_candump(path: Path, style: str = "-l", head: str = "") -> Path:
+    """Frames as candump writes them: its log file, frames of CAN FD, or what it shows with times, below a head."""
     cantools = pytest.importorskip("cantools", reason="cantools is not installed (extra can)")
     base = cantools.database.load_string(DBC, "dbc")
     frames = [(t, 256, base.encode_message(256, {"Angle": a, "Mode": 1})) for t, a in zip(T, ANGLE, strict=True)]
     frames += [(t, 512, base.encode_message(512, {"Torque": u})) for t, u in zip(T_TORQUE, TORQUE, strict=True)]
     frames += [(0.5, 0x7FF, b"unknown")]
-    lines = []
+    lines, before = [], 0.0
     for t, name, data in sorted(frames):
         between = "##1" if style == "FD" else "#"
-        shown = f"{name:03X}   [{len(data)}]  {data.hex(' ').upper()}"
+        day = pd.Timestamp("2026-03-04 23:59:59") + pd.Timedelta(seconds=t)
+        at = {"A": f"{day:%Y-%m-%d %H:%M:%S.%f}", "d": f"{t - before:010.6f}"}.get(style[3:4], f"{1e9 + t:.6f}")
+        before = t
+        cells = [f"{byte:08b}" if style.endswith("-i") else f"{byte:02X}" for byte in data]
+        shown = "`".join(reversed(cells)) if style.endswith("-S") else " ".join(cells)
         where = "RX - -  " if style.endswith("-x") else ""
-        line = f" can0  {where}{shown}" if style.startswith("-t") else f"can0 {name:03X}{between}{data.hex().upper()}"
-        lines.append(f"({1e9 + t:.6f}) {line}")
-    path.write_text("\n".join([*lines, "(1000000002.000000) can0 100#R"]) + "\n")
+        dumped = f"{name:03X}{between}{data.hex().upper()}"
+        line = f" can0  {where}{name:03X}   [{len(data)}]  {shown}" if style.startswith("-t") else f"can0 {dumped}"
+        lines.append(f"({at}) {line}")
+    path.write_text(
+        "\n".join([head, *lines, *([] if style.startswith("-t") else [f"({1e9 + 2:.6f}) can0 100#R"])]) + "\n"
+    )
     return path
 
 
 def write_lvm(
-    path: Path, x: str, comma: str = ".", separator: str = "Tab", segments: int = 1, comments: bool = False
+    path: Path,
+    x: str,
+    comma: str = ".",
+    separator: str = "Tab",
+    segments: int = 1,
+    comments: bool = False,
+    comma_said: bool = True,
 ) -> Path:
     """A LabVIEW measurement file: x, its X_Columns; in so many segments, with a heading each if there are several."""
     s = {"Tab": "\t", "Comma": ",", "Semicolon": ";"}[separator]
-    lines = ["LabVIEW Measurement", f"Writer_Version{s}2", f"Separator{s}{separator}", f"Decimal_Separator{s}{comma}"]
+    lines = ["LabVIEW Measurement", f"Writer_Version{s}2", f"Separator{s}{separator}"]
+    lines += [f"Decimal_Separator{s}{comma}"] if comma_said else []
     lines += [f"Multi_Headings{s}{'Yes' if segments > 1 else 'No'}", f"X_Columns{s}{x}", "***End_of_Header***", ""]
     for part in np.array_split(np.arange(len(T)), segments):
         late = T[part[0]]

@@ -224,6 +224,9 @@ def test_world_need_not_be_a_link(tmp_path: Path) -> None:
     file.write_text(arm(joint("lift", "basis", "a")).replace("<link name='basis'>", "<link name='base'>"))
     with pytest.raises(MachineError, match=r"joint lift: no link basis \(did you mean base\?\)"):
         read_machine(file, tmp_path, "other")
+    file.write_text('<robot name="r" xmlns:xacro="http://wiki.ros.org/xacro"/>')
+    with pytest.raises(MachineError, match="has no links; a xacro file must be expanded first"):
+        read_machine(file, tmp_path, "empty")
 
 
 def read_machine(file: Path, place: Path, name: str = "m") -> Machine:

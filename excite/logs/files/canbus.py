@@ -6,8 +6,9 @@ import itertools
 import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +26,15 @@ CONTAINER_KIND = 10
 DEFLATE = 2  # method
 MOST_OF_CONTAINER = 100_000_000  # bytes; loggers fill them up to 128 kB; chosen
 FIRST_LINES = 100  # in which a frame is looked for
+FIRST_FRAMES = 1000  # by which it is judged whether times are those since the frame before
 STANDARD, EXTENDED, ERROR = 0x7FF, 0x1FFF_FFFF, 0x2000_0000  # bits of an identifier; linux/can.h
 STANDARD_DIGITS = 3  # of an identifier of 11 bits
-BYTES = r"(?P<data>(?:[0-9A-Fa-f]{2}[ .]?)*)"
 FRAME = re.compile(  # (1.5) can0 123#0011, 123##10011, 123#R and (1.5)  can0  RX - -  123   [2]  00 11
-    rf"\s*\((?P<time>\d+\.\d+)\)\s+(?P<channel>\S+)(?:\s+[TR]X)?(?:\s+[-BE]){{0,2}}\s+(?P<id>[0-9A-Fa-f]{{3,8}})"
-    rf"(?:\#R\d?|\#(?:\#[0-9A-Fa-f])?{BYTES}|\s+\[\d+\]\s+(?:remote request|{BYTES.replace('data', 'shown')}))"
-    r"(?:\s+(?:[TR]|'.*|ERRORFRAME))?\s*$"
+    r"\((?P<time>(?:\d{4}-\d\d-\d\d \d\d:\d\d:)?\d+\.\d+)\)\s+(?P<channel>\S+)(?:\s+[TR]X)?(?:\s+[-BE]){0,2}"
+    r"\s+(?P<id>[0-9A-Fa-f]{3,8})(?:#(?:R\d?|(?:#[0-9A-Fa-f])?(?P<data>(?:[0-9A-Fa-f]{2}\.?)*))(?:\s+[TR])?"
+    r"|\s+\[(?P<size>\d+)\]\s*(?:remote request|(?P<shown>[0-9A-Fa-f` ]*)(?:'.*|ERRORFRAME)?))$"
 )
-UNTIMED = re.compile(r"\s*\w+\s+[0-9A-Fa-f]{3,8}\s+\[\d+\]\s")
+UNTIMED = re.compile(r"\w+\s+[0-9A-Fa-f]{3,8}\s+\[\d+\]\s")
 DATABASES = (".dbc", ".kcd", ".sym", ".arxml")
 
 
@@ -100,46 +101,86 @@ def read_can(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
 
 
 def is_candump(path: Path) -> bool:
-    """Tell if a file is what candump of can-utils writes, by the first line that is not blank."""
+    """Tell if a file is what candump of can-utils writes: one of its first lines is a frame."""
     with path.open("rb") as file:
-        first = next((line for line in itertools.islice(file, FIRST_LINES) if line.strip()), b"")
-    return bool(FRAME.match(first.decode(errors="replace")) or UNTIMED.match(first.decode(errors="replace")))
+        first = [line.decode(errors="replace").strip() for line in itertools.islice(file, FIRST_LINES)]
+    return any(FRAME.match(line) or UNTIMED.match(line) for line in first)
 
 
 @contextmanager
 def _candump(path: Path, notes: list[str]) -> Iterator[Iterator[Any]]:
     """Give the frames of candump's log file or of what it shows; what is no frame is noted. Raises LogError."""
-
-    def frames() -> Iterator[Any]:
-        import can
-
-        strange = 0
-        for line in file:
-            found = FRAME.match(line)
-            if found is None:
-                if UNTIMED.match(line):
-                    raise LogError(f"{path}: frames without times: record with `candump -l`, or `candump -t a`")
-                strange += bool(line.strip())
-                continue
-            at, channel, name = found.group("time", "channel", "id")
-            data = next((d for d in found.group("data", "shown") if d is not None), None)
-            extended = len(name) > STANDARD_DIGITS
-            mask = EXTENDED if extended else STANDARD
-            yield can.Message(
-                timestamp=float(at),
-                arbitration_id=int(name, 16) & mask,
-                is_extended_id=extended,
-                is_error_frame=bool(int(name, 16) & ERROR) and extended,
-                is_remote_frame=data is None,
-                data=bytes.fromhex((data or "").replace(".", "")),
-                is_fd=True,
-                channel=channel,
-            )
-        if strange:
-            notes.append(f"{count(strange, 'line is', 'lines are')} no frame, left out")
-
     with path.open(encoding="utf-8", errors="replace") as file:
-        yield frames()
+        frames = _frames(path, file, notes)
+        first = list(itertools.islice(frames, FIRST_FRAMES))
+        every: Iterator[Any] = itertools.chain(first, frames)
+        if _since_frame_before([frame.timestamp for frame in first]):
+            notes.append("times are those since the frame before (candump -t d), added up")
+            every = _added_up(every)
+        yield every
+
+
+def _frames(path: Path, lines: Iterable[str], notes: list[str]) -> Iterator[Any]:
+    """Yield the frames of lines at the times that these give. Raises LogError for frames without times."""
+    import can
+
+    strange = 0
+    for line in map(str.strip, lines):
+        found = FRAME.match(line)
+        try:
+            at, data = (0.0, b"") if found is None else (_seconds(found["time"]), _data(found))
+        except ValueError:  # a day that no calendar has, or not as many bytes as are said
+            found = None
+        if found is None:
+            if UNTIMED.match(line):
+                raise LogError(f"{path}: frames without times: record with `candump -l`, or `candump -t a`")
+            strange += bool(line)
+            continue
+        name = found["id"]
+        extended = len(name) > STANDARD_DIGITS
+        yield can.Message(
+            timestamp=at,
+            arbitration_id=int(name, 16) & (EXTENDED if extended else STANDARD),
+            is_extended_id=extended,
+            is_error_frame=bool(int(name, 16) & ERROR) and extended,
+            is_remote_frame=data is None,
+            data=data,
+            is_fd=True,
+            channel=found["channel"],
+        )
+    if strange:
+        notes.append(f"{count(strange, 'line is', 'lines are')} no frame, left out")
+
+
+def _seconds(text: str) -> float:
+    """Return the time [s] that a line gives, as a number or with its date. Raises ValueError."""
+    return float(text) if "-" not in text else datetime.fromisoformat(text).replace(tzinfo=UTC).timestamp()
+
+
+def _data(found: re.Match[str]) -> bytes | None:
+    """Return the bytes of a frame, None of a remote one; `between them: in reverse. Raises ValueError."""
+    if found["shown"] is None:
+        return None if found["data"] is None else bytes.fromhex(found["data"].replace(".", ""))
+    cells = found["shown"].replace("`", " ").split()
+    if len(cells) != int(found["size"]):
+        raise ValueError(f"{len(cells)} bytes")
+    bits = all(len(cell) == 8 for cell in cells)
+    return bytes(int(cell, 2 if bits else 16) for cell in (reversed(cells) if "`" in found["shown"] else cells))
+
+
+def _since_frame_before(times: Sequence[float]) -> bool:
+    """Tell if times [s] begin at zero and do not grow: the last third is no later than the first."""
+    third = len(times) // 3
+    return third > 1 and times[0] == 0.0 and bool(np.median(times[-third:]) <= np.quantile(times[:third], 0.9))
+
+
+def _added_up(frames: Iterable[Any]) -> Iterator[Any]:
+    """Yield frames whose times are those since the frame before at the times since the first one."""
+    at = 0.0
+    for frame in frames:
+        at += frame.timestamp
+        frame.timestamp = at
+        yield frame
 
 
 def _refuse_stuck(path: Path) -> None:

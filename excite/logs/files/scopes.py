@@ -61,7 +61,9 @@ def _labview(path: Path, lines: list[str], notes: list[str]) -> tuple[list[Group
     separator = SEPARATORS.get(settings.get("Separator", "").lower()) or max("\t;,", key=sample.count)
     if not settings:  # written with another separator than tabs
         settings = {c[0].strip(): c[1].strip() for line in lines[: marks[0]] if len(c := line.split(separator)) > 1}
-    comma = "," if settings.get("Decimal_Separator") == "," else "."
+    row = lines[names_at + 1] if names_at + 1 < len(lines) else ""
+    unsaid = "," if separator != "," and "," in row and "." not in row else "."  # by early versions
+    comma = "," if settings.get("Decimal_Separator", unsaid) == "," else "."
     every, units = list[list[Group]](), dict[str, str]()
     names: list[str] = []
     starts: list[float] = []
