@@ -32,7 +32,6 @@ from .figures import (
     budget_figure as budget_figure,
     comparison_figure as comparison_figure,
     correlation_figure as correlation_figure,
-    escape_dollar as escape_dollar,
     is_narrow as is_narrow,
     legend_above as legend_above,
     legend_below as legend_below,
@@ -42,6 +41,7 @@ from .figures import (
     save as save,
     set_title as set_title,
     verify_figure as verify_figure,
+    wrap_label as wrap_label,
 )
 from .handover_descriptions import rehearsal_words as rehearsal_words
 from .html import (

@@ -33,6 +33,10 @@ CAPTIONS = {
     " difference or sum far better than each of them.",
     "prior.png": "What the machine file calls known and what the log adds: grey, the 95 % interval before the log,"
     " diamonds and bars the estimate and its 95 % interval, all in standard deviations known before.",
+    "budget.png": "What makes the variance of each parameter: noise with what the model lacks, and the tolerances of"
+    " the machine file. What takes a large share is worth measuring.",
+    "curves.png": "The torque that the model lacks in each joint as a function of one signal: mean, and its 95 % band."
+    " Flat at zero is right.",
     "log.png": "Every channel that the machine file knows, in SI units, over time: as recorded, and as it is used after"
     " repair and resampling.",
     "signals.png": "Left, the share of each signal's error that is systematic, the rest being noise. Right, the error"
