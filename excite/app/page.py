@@ -41,14 +41,14 @@ ACTIONS = {
     "diagnose": "Diagnose",
 }
 LINKS = {
-    "report.html": "report",
+    "report.html": "report, with plots that zoom",
     "sheet.pdf": "sheet for the driver (PDF)",
     "driver.html": "page for the cab",
     "profile.csv": "profile (CSV)",
     "machine.toml": "machine file with what was found",
 }  # files of a result that one opens
 STOPS = {"design": "Stop and keep the best", "diagnose": "Stop and keep what was found"}
-MARKS = {"done": "✓", "failed": "✗", "running": "…", "to do again": "↻", "ready": "→", "waiting": ""}
+MARKS = {"done": "✓", "doubtful": "?", "failed": "✗", "running": "…", "to do again": "↻", "ready": "→", "waiting": ""}
 
 
 class Window:
@@ -56,7 +56,7 @@ class Window:
 
     def __init__(self, day: Day) -> None:
         self.day = day
-        open_steps = [s for s in STEPS if day.state(s) != "done"]
+        open_steps = [s for s in STEPS if day.state(s) not in ("done", "doubtful")]
         running = day.job.step if day.running and day.job else None
         self.step = running or (open_steps[0] if open_steps else "diagnose")
         self.shown: dict[str, Any] = {}
@@ -185,11 +185,13 @@ class Window:
             self.progress.value = job.done / job.total if job.total else 0.0
             self.stop.text = "End it at once" if job.stops else STOPS.get(job.step, "Stop")
             said = f"{what} is running."
+        elif job.step != self.step:  # a message is of its own step
+            said = ""
         elif job.message:
             said = f"{what}: {job.message}"
         else:
             said = f"{what}: ended after {job.elapsed_s:.0f} s."
-        failed = not job.running and bool(job.message)
+        failed = bool(said) and not job.running and bool(job.message)
         look = "error" if failed else "unseen" if job.running else ""
         self.said.classes(replace=f"said {look}").props(f"role={'alert' if failed else 'status'}")
         self.said.text = said
@@ -281,7 +283,16 @@ class Window:
                     ui.label(f"{changed}: do this step again.").classes("changed")
                 ui.html(reports.result_fragment(said), sanitize=False)
                 self._links(result)
+                self._settings(result)
                 self._figures(result)
+
+    def _settings(self, result: Result) -> None:
+        """Show by which settings a result was made."""
+        with ui.expansion("How it was made").classes("more-settings"), ui.element("dl").classes("how"):
+            for name, value in reports.provenance(result.summary, result.summary.get("command")).items():
+                for tag, text in (("dt", name), ("dd", value)):
+                    with ui.element(tag):
+                        ui.label(text)
 
     def _figures(self, result: Result) -> None:
         for picture in reports.folder_pictures(result.folder, result.summary):
@@ -299,7 +310,8 @@ class Window:
 
     def _figure(self, path: Path, caption: str) -> None:
         with ui.element("figure"):
-            ui.element("img").props["src"] = self._url(path)
+            with ui.link(target=self._url(path), new_tab=True).props(f'aria-label="{path.stem}, full size"'):
+                ui.element("img").props["src"] = self._url(path)
             with ui.element("figcaption"):
                 ui.label(caption)
 

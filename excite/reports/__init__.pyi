@@ -51,7 +51,12 @@ from .html import (
     templates as templates,
 )
 from .log_check import check_log as check_log, log_account as log_account, log_frame as log_frame
-from .pages import REPORT as REPORT, folder_pictures as folder_pictures, write_report as write_report
+from .pages import (
+    REPORT as REPORT,
+    folder_pictures as folder_pictures,
+    provenance as provenance,
+    write_report as write_report,
+)
 from .plain_text import PIPE_WIDTH as PIPE_WIDTH, text_parts as text_parts, text_table as text_table
 from .results import (
     Account as Account,
@@ -60,6 +65,7 @@ from .results import (
     ShownCampaign as ShownCampaign,
     ShownComparison as ShownComparison,
     ShownDesign as ShownDesign,
+    ShownDrive as ShownDrive,
     ShownEstimate as ShownEstimate,
     ShownLog as ShownLog,
     ShownPrediction as ShownPrediction,
@@ -67,6 +73,7 @@ from .results import (
     ShownSlip as ShownSlip,
     ShownVerification as ShownVerification,
     drive_frame as drive_frame,
+    joints_frame as joints_frame,
     rows_frame as rows_frame,
 )
 from .slip_figure import slip_figure as slip_figure

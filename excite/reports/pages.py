@@ -53,6 +53,12 @@ CAPTIONS = {
     "study.png": "Cell by cell: each parameter's error, root mean square over the cell's runs [%], and the share of 95"
     " % intervals that hold; or the verdicts of diagnosis; or the drives' condition numbers.",
 }
+ARM_CAPTIONS = {  # of motions that a position controller follows
+    "design.png": "The motion: torques in per cent of their limits, speeds and angles of the joints over time, dotted"
+    " lines the limits; the most used share of each limit, in per cent. Torques that swing fast have an excerpt.",
+    "sigma.png": "Attainable accuracy of the motion: one standard deviation (Cramer-Rao bound, all sensors together) of"
+    " every parameter in per cent of its nominal value, on a logarithmic axis.",
+}
 ZOOM = " On the screen: drag to zoom, point to read values, the arrows go back; names hide curves."
 FOLDED = {  # figures that a reader opens, by what they are called
     "misfit": "what each torque lacks against everything",
@@ -152,6 +158,8 @@ def provenance(summary: Summary, command: str | None = None) -> dict[str, str]:
 
 
 def _caption(name: str, summary: Summary) -> str:
+    if summary.get("trajectory") and name in ARM_CAPTIONS:
+        return ARM_CAPTIONS[name]
     if name in CAPTIONS:
         return CAPTIONS[name]
     kind, _, number = name.removesuffix(".png").partition("-")

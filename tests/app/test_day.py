@@ -95,6 +95,9 @@ def test_day_is_read_from_what_the_commands_wrote(
     assert (day.machine, day.logs) == ("mine.toml", ["log.csv"])
     states = {step: day.state(step) for step in ("machine", "design", "drive", "log", "identify")}
     assert states == {"machine": "ready", "design": "waiting", "drive": "waiting", "log": "done", "identify": "ready"}
+    summary = Path("results/checked/summary.json")
+    summary.write_text(json.dumps(json.loads(summary.read_text()) | {"doubts": ["the front encoder is coarse"]}))
+    assert Day(Path("results")).state("log") == "doubtful"
     later = time.time() + 60
     os.utime("mine.toml", (later, later))
     assert day.state("log") == "to do again"
@@ -102,6 +105,23 @@ def test_day_is_read_from_what_the_commands_wrote(
     Path("mine.toml").write_text('extends = "va12_straight"\nname = \n')
     assert "mine.toml" in lacking(day, "design")[0]
     assert not day.ready("log")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("starts", None, ["Starting guesses: a number is needed"]),
+        ("starts", 2.5, ["Starting guesses: must be a whole number (got 2.5)"]),
+        ("duration", -5, ["Length of the drive [s]: must be 1 or more (got -5)"]),
+        ("duration", None, []),
+        ("starts", 3.0, []),
+    ],
+)
+def test_a_wrong_number_is_said_and_never_replaced(tmp_path: Path, key: str, value: object, said: list[str]) -> None:
+    day = Day(tmp_path)
+    day.forms["design"][key] = value
+    assert day.wrong_numbers("design") == said
+    assert day.forms["design"][key] == value
 
 
 TEXT = """\
