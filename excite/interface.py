@@ -219,7 +219,7 @@ def campaign(
         InfeasibleError, SolverError, UsageError: as in `design`.
 
     Example:
-        >>> day = excite.campaign("va12_straight", target=20.0, duration=8, starts=1, budget=5)
+        >>> day = excite.campaign("va12_straight", target=20.0, duration=10, starts=1)
         >>> len(day.drives)
         1
     """
@@ -544,7 +544,7 @@ def compare(
         MachineError: sensors of unknown noise, or an arm.
 
     Example:
-        >>> drives = excite.compare("va12_straight", against=["multisine"], samples=2, budget=3)
+        >>> drives = excite.compare("va12_straight", against=["multisine"], samples=2)
         >>> "designed" in drives.to_frame().index
         True
     """

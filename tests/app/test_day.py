@@ -17,6 +17,7 @@ from support.logs import logged
 
 from excite.app.day import Day
 from excite.app.key_lines import find_line
+from excite.app.live_view import draw_text
 from excite.logs import SUFFIXES
 from excite.model import Model
 from excite.simulation import simulate
@@ -96,8 +97,10 @@ def test_day_is_read_from_what_the_commands_wrote(
     states = {step: day.state(step) for step in ("machine", "design", "drive", "log", "identify")}
     assert states == {"machine": "ready", "design": "waiting", "drive": "waiting", "log": "done", "identify": "ready"}
     summary = Path("results/checked/summary.json")
-    summary.write_text(json.dumps(json.loads(summary.read_text()) | {"doubts": ["the front encoder is coarse"]}))
+    clean = summary.read_text()
+    summary.write_text(json.dumps(json.loads(clean) | {"doubts": ["the front encoder is coarse"]}))
     assert Day(Path("results")).state("log") == "doubtful"
+    summary.write_text(clean)
     later = time.time() + 60
     os.utime("mine.toml", (later, later))
     assert day.state("log") == "to do again"
@@ -122,6 +125,21 @@ def test_a_wrong_number_is_said_and_never_replaced(tmp_path: Path, key: str, val
     day.forms["design"][key] = value
     assert day.wrong_numbers("design") == said
     assert day.forms["design"][key] == value
+
+
+def test_a_text_is_drawn_from_above_while_it_is_right(tmp_path: Path) -> None:
+    """What is wrong names the file itself, and no draft stays."""
+    path = tmp_path / "mine.toml"
+    drawing, fault = draw_text('extends = "va12"\nname = "mine"\n', path)
+    assert drawing.startswith("data:image/png;base64,iVBOR")
+    assert fault == ""
+    wide = 'extends = "va12"\nname = "mine"\n[body.front_roll.contact]\nwidth = { value = 3, source = "measured" }\n'
+    assert draw_text(wide, path)[0] not in ("", drawing)
+    drawing, fault = draw_text(wide.replace("width", "widt"), path)
+    assert drawing == ""
+    assert fault.startswith("mine.toml: body[1].contact.widt: no such key here")
+    assert draw_text('extends = "ur10"\nname = "mine"\n', path) == ("", "")
+    assert list(tmp_path.iterdir()) == []
 
 
 TEXT = """\

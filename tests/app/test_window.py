@@ -193,7 +193,7 @@ def test_a_test_day_from_machine_to_named_cause(tmp_path: Path, browser: Any, st
         hand.step("Design")
         hand.write("Length of the drive", "-5")
         page.get_by_text("must be 1 or more (got -5)").wait_for()
-        assert page.get_by_role("button", name="Design the drive").is_disabled()
+        page.get_by_role("button", name="Design the drive", disabled=True).wait_for()
         hand.write("Length of the drive", "12")
         hand.write("Starting guesses", "1")
         hand.choose("Minimise", "accuracy")
