@@ -7,6 +7,7 @@ import contextlib
 import doctest
 import importlib
 import inspect
+import itertools
 import json
 import os
 import pty
@@ -29,7 +30,7 @@ import excite as interface
 from excite import output, trajectories, workflows
 from excite.cli import app, reference, reference_html
 from excite.model.effects import catalogue
-from excite.model.machine import units
+from excite.model.machine import shipped_machines, units
 
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
@@ -64,6 +65,25 @@ def test_links_lead_somewhere() -> None:
     for page in pages:
         for link in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
             assert link.startswith("https://") or (page.parent / link).exists(), f"{page.name}: {link}"
+
+
+PARAMETERS = {
+    name: number
+    for names, numbers in re.findall(
+        r"^\| (`[^|]*`) \| [^|]* \| ([\d, ]+) \|$", (ROOT / "docs" / "machines.md").read_text(encoding="utf-8"), re.M
+    )
+    for name, number in zip(re.findall("`(.*?)`", names), itertools.cycle(map(int, numbers.split(","))), strict=False)
+}
+
+
+def test_the_page_on_machines_lists_every_machine() -> None:
+    assert set(PARAMETERS) == set(shipped_machines())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_the_page_on_machines_counts_parameters_as_the_model_does(name: str) -> None:
+    assert len(interface.load(name).base.names) == PARAMETERS[name]
 
 
 def test_the_page_on_sensors_has_the_study_s_table() -> None:

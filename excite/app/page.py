@@ -14,6 +14,7 @@ from nicegui import ui
 
 from excite import output, reports, trajectories
 from excite.app import editor, fields
+from excite.app.course import draw_course
 from excite.app.day import STEPS, Day
 from excite.app.job import Job, command_line
 from excite.app.results import Result
@@ -103,6 +104,7 @@ class Window:
                 self.numbers = ui.label()
             self.progress = ui.linear_progress(show_value=False).props('aria-label="Progress" instant-feedback')
             self.stop = ui.button("Stop", on_click=self._stop).props("no-caps outline")
+            self.course = ui.html("", sanitize=False).classes("course")
         self.said = ui.label().classes("said").props("role=status aria-live=polite")
 
     def _action_row(self) -> None:
@@ -183,6 +185,7 @@ class Window:
             self.numbers.text = f"{job.elapsed_s:.0f} s{best}"
             self.progress.props(f"{'indeterminate' if not job.total else ':indeterminate=false'}")
             self.progress.value = job.done / job.total if job.total else 0.0
+            self.course.content = draw_course(job.course, job.elapsed_s)
             self.stop.text = "End it at once" if job.stops else STOPS.get(job.step, "Stop")
             said = f"{what} is running."
         elif job.step != self.step:  # a message is of its own step

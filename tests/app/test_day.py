@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import time
 from pathlib import Path
@@ -15,6 +16,7 @@ from support.commands import Excite
 from support.drives import drive
 from support.logs import logged
 
+from excite.app.course import draw_course
 from excite.app.day import Day
 from excite.app.key_lines import find_line
 from excite.app.live_view import draw_text
@@ -125,6 +127,17 @@ def test_a_wrong_number_is_said_and_never_replaced(tmp_path: Path, key: str, val
     day.forms["design"][key] = value
     assert day.wrong_numbers("design") == said
     assert day.forms["design"][key] == value
+
+
+def test_the_course_of_a_search_falls_and_ends_now() -> None:
+    assert draw_course([], 5) == draw_course([(1, 40.0)], 5) == draw_course([(0, float("inf")), (1, 40.0)], 5) == ""
+    drawn = draw_course([(0, float("inf")), (1, 100.0), (3, 10.0), (5, 1.0)], 9)
+    points = re.findall(r"([\d.]+),([\d.]+)", drawn.partition("points=")[2])
+    x, y = np.array(points, float).T
+    assert np.all(np.diff(x) >= 0)
+    assert (x[0], x[-1]) == (6, 354)
+    assert np.unique(y) == pytest.approx([6, 35, 64])  # of equal ratios equal steps, the lowest score at the bottom
+    assert "100 at 1 s, 1 now" in drawn
 
 
 def test_a_text_is_drawn_from_above_while_it_is_right(tmp_path: Path) -> None:
