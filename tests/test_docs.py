@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import doctest
 import importlib
+import inspect
+import itertools
 import json
 import os
 import pty
@@ -16,16 +19,18 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import pytest
 import typer
 from support import studies
 from support.commands import Excite
 
 import excite as interface
-from excite import output
+from excite import output, trajectories, workflows
 from excite.cli import app, reference, reference_html
 from excite.model.effects import catalogue
-from excite.model.machine import units
+from excite.model.machine import shipped_machines, units
 
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
@@ -60,6 +65,25 @@ def test_links_lead_somewhere() -> None:
     for page in pages:
         for link in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
             assert link.startswith("https://") or (page.parent / link).exists(), f"{page.name}: {link}"
+
+
+PARAMETERS = {
+    name: number
+    for names, numbers in re.findall(
+        r"^\| (`[^|]*`) \| [^|]* \| ([\d, ]+) \|$", (ROOT / "docs" / "machines.md").read_text(encoding="utf-8"), re.M
+    )
+    for name, number in zip(re.findall("`(.*?)`", names), itertools.cycle(map(int, numbers.split(","))), strict=False)
+}
+
+
+def test_the_page_on_machines_lists_every_machine() -> None:
+    assert set(PARAMETERS) == set(shipped_machines())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_the_page_on_machines_counts_parameters_as_the_model_does(name: str) -> None:
+    assert len(interface.load(name).base.names) == PARAMETERS[name]
 
 
 def test_the_page_on_sensors_has_the_study_s_table() -> None:
@@ -195,6 +219,26 @@ def test_every_public_function_has_an_example() -> None:
     assert set(codes) - {*functions} == {"Results", "Errors"}
 
 
+@pytest.mark.parametrize("name", [name for name in interface.__all__ if name != "__version__"])
+def test_a_docstring_names_every_argument(name: str) -> None:
+    """And says what comes back, what is raised, and how the function is called."""
+    function = getattr(interface, name)
+    text = inspect.cleandoc(function.__doc__)
+    parts = re.split(r"^(Parameters|Returns|Raises|Example):\n", text, flags=re.MULTILINE)
+    assert parts[1::2] == ["Parameters", "Returns", "Raises", "Example"]
+    told = ", ".join(re.findall(r"^    (\S[^:]*): ", parts[2], re.MULTILINE))
+    assert sorted(told.split(", ")) == sorted(inspect.signature(function).parameters)
+    assert f"excite.{name}(" in parts[8]
+
+
+@pytest.mark.slow
+def test_examples_of_docstrings_run() -> None:
+    names = {"excite": interface, "np": np, "pd": pd}
+    for name in interface.__all__:
+        for one in doctest.DocTestFinder().find(getattr(interface, name), name, globs=names):
+            assert doctest.DocTestRunner().run(one).failed == 0, name
+
+
 @pytest.mark.slow
 def test_examples_in_python_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -280,6 +324,13 @@ def test_every_command_has_an_example() -> None:
     """In its help, and the example names the command itself."""
     for name, command in reference._commands(typer.main.get_command(app), "excite"):
         assert f"Example: {name} " in (command.help or ""), name
+
+
+def test_the_help_of_studies_lists_every_key_and_its_names(excite: Excite) -> None:
+    text = " ".join(excite("study", "--help")[1].split())
+    for record in (workflows.Study, workflows.Study.model_fields["grid"].annotation.__args__[0]):  # type: ignore[union-attr]
+        assert all(f" {key} " in text for key in record.model_fields)
+    assert all(name in text for name in trajectories.OBJECTIVES)
 
 
 def test_every_command_has_json() -> None:

@@ -37,6 +37,41 @@ class Need:
     text: str
 
 
+@dataclass(frozen=True)
+class NumberField:
+    """What the field of a number takes: its label, least value, whether a whole number, whether it may be empty."""
+
+    label: str
+    low: float
+    whole: bool = False
+    needed: bool = False
+
+    def fault(self, value: Any) -> str:
+        """Return what is wrong with a value, "" for nothing."""
+        if value in (None, ""):
+            return "a number is needed" if self.needed else ""
+        if value < self.low:
+            return f"must be {self.low:g} or more (got {value:g})"
+        return f"must be a whole number (got {value:g})" if self.whole and value != int(value) else ""
+
+
+NUMBERS = {  # fields of numbers by step
+    "design": {
+        "duration": NumberField("Length of the drive [s]", 1),
+        "starts": NumberField("Starting guesses", 1, whole=True, needed=True),
+        "budget": NumberField("Time for the search [s]", 1),
+        "sigma_max": NumberField("Largest standard deviation allowed [%]", 0.001),
+        "seed": NumberField("Seed", 0, whole=True, needed=True),
+    },
+    "drive": {
+        "phases": NumberField("Most phases", 2, whole=True),
+        "shortest": NumberField("Shortest phase [s]", 0.5),
+    },
+    "log": {"seed": NumberField("Seed", 0, whole=True, needed=True)},
+    "diagnose": {"budget": NumberField("Time for the search [s]", 1)},
+}
+
+
 class Day:
     """The state that every browser shares: choices, forms, the running job, and results as the folder has them.
 
@@ -324,19 +359,33 @@ class Day:
             return [Need(True, f'doubts about the log accepted: "{words}"')]
         return [Need(False, "an answer to the doubts of its check: mend the log, or accept them in step Identify")]
 
+    def wrong_numbers(self, step: str) -> list[str]:
+        """Return what is wrong with the numbers in the fields of a step, by their labels."""
+        form, numbers = self.forms.get(step, {}), NUMBERS.get(step, {})
+        return [f"{one.label}: {said}" for key, one in numbers.items() if (said := one.fault(form[key]))]
+
     def ready(self, step: str) -> bool:
-        """Return True if a step has what it needs and nothing runs."""
-        return all(need.met for need in self.needs(step)) and not self.running
+        """Return True if a step has what it needs, its fields too, and nothing runs."""
+        wrong = step != "log" and self.wrong_numbers(step)  # whose only number is of simulations
+        return all(need.met for need in self.needs(step)) and not wrong and not self.running
 
     def state(self, step: str) -> str:
-        """Return where a step stands: running, failed, to do again, done, ready or waiting."""
+        """Return where a step stands: running, failed, to do again, doubtful, done, ready or waiting."""
         if self.running and self.job and self.job.step == step:
             return "running"
         result = self.result_of(step)
         if result is not None:
             bad = result.summary.get("faults") or result.summary.get("status") == "invalid"
-            return "failed" if bad else "to do again" if self.outdated(result) else "done"
+            if bad or self.outdated(result):
+                return "failed" if bad else "to do again"
+            return "doubtful" if self._in_doubt(step, result) else "done"
         return "ready" if all(need.met for need in self.needs(step)) else "waiting"
+
+    def _in_doubt(self, step: str, result: Result) -> bool:
+        """Return True for a step that ended in doubts which nobody accepted."""
+        if step == "log":
+            return bool(self.doubts()) and not self.accepted_words()
+        return bool(result.summary.get("doubts")) or result.summary.get("status") == "doubtful"
 
     # -------------------------------------------------------------------------------------------- commands
 

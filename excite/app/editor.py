@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from nicegui import ui
+from nicegui import run, ui
 
 from excite import output
-from excite.app import fields
+from excite.app import fields, live_view
 from excite.app.day import Day
 from excite.app.fields import Page
 from excite.app.job import Job
@@ -135,12 +135,39 @@ def _edit(day: Day) -> None:
     with ui.element("div").classes("editor"), ui.element("div").classes("edit"):
         area = ui.textarea(f"Text of {path.name}").props("outlined dense autogrow stack-label spellcheck=false")
         area.classes("toml").bind_value(form, "text")
-        if not is_own(day):
+        if is_own(day):
+            area.props("debounce=500")
+        else:
             area.props("readonly")
         with ui.element("div").classes("beside").props('role=list aria-label="Messages of the check"'):
             for line, kind, message in said:
                 _message(line, kind, message)
     ui.run_javascript(PLACE)
+    if is_own(day):
+        _view(form, path, area)
+
+
+def _view(form: dict[str, Any], path: Path, area: ui.textarea) -> None:
+    """Build the drawing of the machine from above, which follows the text, with what is wrong with the text so far."""
+    with ui.element("figure").classes("live-view"):
+        picture = ui.element("img").props('alt="The machine from above, as the text says"')
+        picture.set_visibility(False)
+        wrong = ui.label().classes("said error").props("role=status")
+
+    async def follow() -> None:
+        text = form["text"]
+        drawing, fault = await run.io_bound(live_view.draw_text, text, path) or ("", "")
+        if picture.is_deleted or text != form["text"]:  # another page, or another text, which is drawn as well
+            return
+        wrong.text = fault
+        if fault:  # the drawing of before stays
+            return
+        picture.set_visibility(bool(drawing))
+        picture.props["src"] = drawing
+        picture.update()
+
+    area.on_value_change(follow)
+    ui.timer(0.0, follow, once=True)
 
 
 def _message(line: int | None, kind: str, message: str) -> None:

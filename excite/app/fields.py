@@ -8,7 +8,7 @@ from typing import Any, Protocol
 from nicegui import ui
 
 from excite import workflows
-from excite.app.day import Day
+from excite.app.day import NUMBERS, Day
 from excite.app.job import Job
 from excite.app.results import Result, is_readable_file
 
@@ -26,9 +26,11 @@ class Page(Protocol):
     def tick(self) -> None: ...
 
 
-def number(form: dict[str, Any], key: str, label: str, hint: str = "", **limits: Any) -> ui.number:
-    """Add a field for a number; an empty one is None."""
-    return ui.number(label, **limits).props(_hint(hint)).bind_value(form, key).classes("field")
+def number(day: Day, step: str, key: str, hint: str = "") -> None:
+    """Add a field for a number, which says below it what is wrong with it; an empty one is None."""
+    one = NUMBERS[step][key]
+    field = ui.number(one.label, validation=lambda value: one.fault(value) or None, step=1 if one.whole else None)
+    field.props(_hint(hint)).bind_value(day.forms[step], key).classes("field").validate()
 
 
 def words(form: dict[str, Any], key: str, label: str, hint: str = "") -> ui.input:
@@ -76,27 +78,26 @@ def design(day: Day, page: Page) -> None:
     usual = float((machine.problems or arm)[form["problem"]].duration_s)
     with row():
         choice(form, "problem", "Design problem", problems, "of the machine file")
-        number(form, "duration", "Length of the drive [s]", f"empty: the problem's own, {usual:g} s", min=1)
+        number(day, "design", "duration", f"empty: the problem's own, {usual:g} s")
         choice(form, "objective", "Minimise", list(workflows.choices("objective")), "accuracy: the smallest errors")
-        number(form, "starts", "Starting guesses", "more may find a better drive", min=1, precision=0)
-        number(form, "budget", "Time for the search [s]", "empty: until it converges", min=1)
+        number(day, "design", "starts", "more may find a better drive")
+        number(day, "design", "budget", "empty: until it converges")
         words(form, "out", "Name of the result", "empty: a new name")
     if not arm:  # whose designs are motions of its joints
         with row():
             tick_box(form, "driver", "for a person at the levers, in phases")
             tick_box(form, "robust", "for machines up to 20 % off as well")
     with ui.expansion("More settings").classes("more-settings"), row():
-        number(form, "sigma_max", "Largest standard deviation allowed [%]", "empty: no bound", min=0)
-        number(form, "seed", "Seed", "same seed, same result", min=0, precision=0)
+        number(day, "design", "sigma_max", "empty: no bound")
+        number(day, "design", "seed", "same seed, same result")
 
 
 def drive(day: Day, page: Page) -> None:
     """Fields of the driver's aids."""
-    form = day.forms["drive"]
     with row():
         _choose_design(day)
-        number(form, "phases", "Most phases", "empty: as many as it takes", min=2, precision=0)
-        number(form, "shortest", "Shortest phase [s]", "empty: 2 s", min=0.5)
+        number(day, "drive", "phases", "empty: as many as it takes")
+        number(day, "drive", "shortest", "empty: 2 s")
 
 
 def _choose_design(day: Day) -> None:
@@ -145,19 +146,19 @@ def log(day: Day, page: Page) -> None:
         return
     with ui.expansion("No log yet? Simulate one").classes("more-settings"), row():
         words(form, "effect", "Effect that the model lacks", "such as ground_slope=0.01; empty for none")
-        number(form, "seed", "Seed", "of the sensors' noise", min=0, precision=0)
+        number(day, "log", "seed", "of the sensors' noise")
         ui.button("Simulate a log of the design", on_click=lambda: simulate(day, page)).props("no-caps outline")
 
 
 def simulate(day: Day, page: Page) -> None:
     """Simulate a log of the design and choose it."""
     chosen, form = day.design(), day.forms["log"]
-    if chosen is None or day.machine is None:
+    if chosen is None or day.machine is None or day.wrong_numbers("log"):
         return
     names = (day.folder / f"simulated{'' if k == 1 else f'-{k}'}.csv" for k in range(1, 1000))
     path = next(p for p in names if not p.exists())
     effect = ["--effect", form["effect"]] if form["effect"] else []
-    seed = ["--seed", str(int(form["seed"] or 0))]
+    seed = ["--seed", str(int(form["seed"]))]
     arguments = ["simulate", day.machine, str(chosen.folder / "profile.csv"), *effect, *seed, "--out", str(path)]
 
     def done(job: Job) -> None:
@@ -221,7 +222,7 @@ def diagnose(day: Day, page: Page) -> None:
     """Fields of the diagnosis."""
     form = day.forms["diagnose"]
     with row():
-        number(form, "budget", "Time for the search [s]", "empty: until it is done", min=1)
+        number(day, "diagnose", "budget", "empty: until it is done")
         words(form, "out", "Name of the result", f"empty: {day.out('diagnose').name}" if day.machine else "")
     tick_box(form, "next", "also design the drive that separates tied causes (minutes)")
 

@@ -24,14 +24,15 @@ class Job:
     """A running or finished command.
 
     label, done, total, best, doing: progress as the command reports it; best None without a score, doing what it does
-    now. code: exit code, None while it runs. message: its error in one line, "" for none. ended: called once, in a
-    thread, when it has ended.
+    now. course: time [s] and score of each improvement. code: exit code, None while it runs. message: its error in one
+    line, "" for none. ended: called once, in a thread, when it has ended.
     """
 
     def __init__(self, step: str, arguments: Sequence[str], out: Path, ended: Callable[[Job], None]) -> None:
         self.step, self.arguments, self.out, self._ended = step, tuple(arguments), out, ended
         self.label, self.done, self.total, self.best = "working", 0, 0, None
         self.doing: str | None = None
+        self.course: list[tuple[float, float]] = []
         self.begin = time.monotonic()
         self.seconds = 0.0
         self.code: int | None = None
@@ -87,6 +88,8 @@ class Job:
                 said = json.loads(line)
                 self.label, self.done, self.total, self.best = (said[k] for k in ("label", "done", "total", "best"))
                 self.doing = said["doing"]
+                if self.best is not None and (not self.course or self.best != self.course[-1][1]):
+                    self.course.append((self.elapsed_s, self.best))
             except (ValueError, TypeError, KeyError):
                 last = line.strip() or last
                 defect = defect or line.startswith("Traceback")

@@ -14,6 +14,7 @@ from nicegui import ui
 
 from excite import output, reports, trajectories
 from excite.app import editor, fields
+from excite.app.course import draw_course
 from excite.app.day import STEPS, Day
 from excite.app.job import Job, command_line
 from excite.app.results import Result
@@ -41,7 +42,7 @@ ACTIONS = {
     "diagnose": "Diagnose",
 }
 LINKS = {
-    "report.html": "report",
+    "report.html": "report, with plots that zoom",
     "motion.html": "motion in a window of its own",
     "sheet.pdf": "sheet for the driver (PDF)",
     "driver.html": "page for the cab",
@@ -49,7 +50,7 @@ LINKS = {
     "machine.toml": "machine file with what was found",
 }  # files of a result that one opens
 STOPS = {"design": "Stop and keep the best", "diagnose": "Stop and keep what was found"}
-MARKS = {"done": "✓", "failed": "✗", "running": "…", "to do again": "↻", "ready": "→", "waiting": ""}
+MARKS = {"done": "✓", "doubtful": "?", "failed": "✗", "running": "…", "to do again": "↻", "ready": "→", "waiting": ""}
 
 
 class Window:
@@ -57,7 +58,7 @@ class Window:
 
     def __init__(self, day: Day) -> None:
         self.day = day
-        open_steps = [s for s in STEPS if day.state(s) != "done"]
+        open_steps = [s for s in STEPS if day.state(s) not in ("done", "doubtful")]
         running = day.job.step if day.running and day.job else None
         self.step = running or (open_steps[0] if open_steps else "diagnose")
         self.shown: dict[str, Any] = {}
@@ -104,6 +105,7 @@ class Window:
                 self.numbers = ui.label()
             self.progress = ui.linear_progress(show_value=False).props('aria-label="Progress" instant-feedback')
             self.stop = ui.button("Stop", on_click=self._stop).props("no-caps outline")
+            self.course = ui.html("", sanitize=False).classes("course")
         self.said = ui.label().classes("said").props("role=status aria-live=polite")
 
     def _action_row(self) -> None:
@@ -184,13 +186,16 @@ class Window:
             self.numbers.text = f"{job.elapsed_s:.0f} s{best}"
             self.progress.props(f"{'indeterminate' if not job.total else ':indeterminate=false'}")
             self.progress.value = job.done / job.total if job.total else 0.0
+            self.course.content = draw_course(job.course, job.elapsed_s)
             self.stop.text = "End it at once" if job.stops else STOPS.get(job.step, "Stop")
             said = f"{what} is running."
+        elif job.step != self.step:  # a message is of its own step
+            said = ""
         elif job.message:
             said = f"{what}: {job.message}"
         else:
             said = f"{what}: ended after {job.elapsed_s:.0f} s."
-        failed = not job.running and bool(job.message)
+        failed = bool(said) and not job.running and bool(job.message)
         look = "error" if failed else "unseen" if job.running else ""
         self.said.classes(replace=f"said {look}").props(f"role={'alert' if failed else 'status'}")
         self.said.text = said
@@ -282,7 +287,16 @@ class Window:
                     ui.label(f"{changed}: do this step again.").classes("changed")
                 ui.html(reports.result_fragment(said), sanitize=False)
                 self._links(result)
+                self._settings(result)
                 self._figures(result)
+
+    def _settings(self, result: Result) -> None:
+        """Show by which settings a result was made."""
+        with ui.expansion("How it was made").classes("more-settings"), ui.element("dl").classes("how"):
+            for name, value in reports.provenance(result.summary, result.summary.get("command")).items():
+                for tag, text in (("dt", name), ("dd", value)):
+                    with ui.element(tag):
+                        ui.label(text)
 
     def _figures(self, result: Result) -> None:
         if (result.folder / reports.MOTION_PAGE).is_file():
@@ -303,7 +317,8 @@ class Window:
 
     def _figure(self, path: Path, caption: str) -> None:
         with ui.element("figure"):
-            ui.element("img").props["src"] = self._url(path)
+            with ui.link(target=self._url(path), new_tab=True).props(f'aria-label="{path.stem}, full size"'):
+                ui.element("img").props["src"] = self._url(path)
             with ui.element("figcaption"):
                 ui.label(caption)
 

@@ -15,7 +15,7 @@ import typer
 from excite import workflows
 from excite.cli import design_commands, log_commands, machine_commands, terminal
 from excite.cli.application import app as app, result_folder
-from excite.cli.options import DrawingCommand, JsonOption, OutOption
+from excite.cli.options import JsonOption, OutOption, StudyCommand
 from excite.errors import UsageError
 
 for part in (machine_commands, design_commands, log_commands):  # in the order of the help
@@ -72,7 +72,7 @@ def docs(out: OutOption = None, json: JsonOption = False) -> None:
         output.write_summary(place, summary)
 
 
-@app.command(cls=DrawingCommand)
+@app.command(cls=StudyCommand)
 def study(
     file: Annotated[
         Path, typer.Argument(metavar="STUDY.toml", help="study file: what to vary and what to do (see `excite docs`)")

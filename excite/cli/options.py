@@ -86,6 +86,18 @@ class DrawingCommand(CommandWithChoices):
             return super().invoke(ctx)
 
 
+class StudyCommand(DrawingCommand):
+    """The command of studies, whose help lists the keys of a study file."""
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        from excite.cli import reference
+
+        super().format_epilog(ctx, formatter)
+        for title, rows in reference.study_keys():
+            with formatter.section(title):
+                formatter.write_dl(rows)
+
+
 MachineArgument = Annotated[
     str,
     typer.Argument(

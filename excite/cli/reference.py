@@ -24,6 +24,8 @@ from excite.model.effects import DEFAULT_DURATION, Effect, Shape, Site, unit_siz
 from excite.model.machine import MEANINGS, UNITS, FileRecord, Machine, load_machine, shipped_machines
 
 MAX_SHAPE_SETS = 8  # sets of shapes that are listed one by one; chosen
+LINK = re.compile(r"\[(\w+)\]\([^)]*\)")
+SECTION = re.compile(r"^(Parameters|Returns|Raises|Example):\n", re.MULTILINE)  # of a docstring
 PLAIN_DEFAULTS = (str, int, float, tuple, type(None))  # types of defaults that are shown
 ADDRESS = re.compile(r"<(?:function |bound method |built-in function )?_?(\S+?)(?: object)? at 0x[0-9a-f]+>")
 WORDS: Mapping[type, str] = {str: "text", int: "whole number", float: "number", bool: "true or false"}
@@ -157,6 +159,23 @@ def machine_page() -> str:
 def study_page() -> str:
     """Write the page of the study file: every record with its keys."""
     return _page("# Study file", "", _doc(inspect.getmodule(workflows.Study)), "", *_keys(workflows.Study))
+
+
+def study_keys() -> Iterator[tuple[str, list[tuple[str, str]]]]:
+    """Yield the tables of a study file: title, and each key with what it takes, its names and its default."""
+    titles = {"Study": "Keys of a study file", "Grid": "Keys of [grid]", "RandomSample": "More keys of [sample]"}
+    seen: dict[str, str] = {}
+    for record in _records(workflows.Study, set()):
+        if record.__name__ not in titles:
+            continue
+        told = {}
+        for name, field in record.model_fields.items():
+            text = LINK.sub(r"\1", _type(field))
+            text = text if '"' in text else workflows.help_with_choices(name, text)
+            default = {"needed": "required"}.get(_default(field), _default(field).strip("`[](){}'-"))
+            told[name] = f"{text}  [{default}]" if default else text
+        yield titles[record.__name__], [(name, text) for name, text in told.items() if seen.get(name) != text]
+        seen = told
 
 
 def _keys(root: type[FileRecord]) -> Iterator[str]:
@@ -328,7 +347,8 @@ def python_page() -> str:
             thing = getattr(package, name)
             if inspect.isfunction(thing) or inspect.isclass(thing):
                 where = f"{package.__name__}.{name}"
-                lines += [f"### {where}", "", "```python", _signature(name, thing), "```", "", _doc(thing), ""]
+                lines += [f"### {where}", "", "```python", _signature(name, thing), "```", ""]
+                lines += [_sections(_doc(thing)), ""]
     return _page(*lines)
 
 
@@ -361,6 +381,21 @@ def _signature(name: str, thing: Any) -> str:
 def _doc(thing: Any) -> str:
     own = thing.__doc__ if not inspect.isclass(thing) else thing.__dict__.get("__doc__")
     return inspect.cleandoc(own) if own else ""
+
+
+def _sections(text: str) -> str:
+    """Return a docstring with its parameters and errors as tables, and its example as code."""
+    head, *rest = SECTION.split(text)
+    parts = [head]
+    for title, body in zip(rest[::2], map(inspect.cleandoc, rest[1::2]), strict=True):
+        if title == "Example":
+            parts += ["```python", body, "```", ""]
+        elif title == "Returns":
+            parts += [f"Returns: {' '.join(body.split())}", ""]
+        else:
+            rows = (tuple(row.partition(": ")[::2]) for row in re.split(r"\n(?=\S)", body))
+            parts += _table(f"{title.lower()} | meaning", rows)
+    return "\n".join(parts).strip()
 
 
 def _cell(text: str) -> str:

@@ -32,7 +32,6 @@ from .figures import (
     budget_figure as budget_figure,
     comparison_figure as comparison_figure,
     correlation_figure as correlation_figure,
-    escape_dollar as escape_dollar,
     is_narrow as is_narrow,
     legend_above as legend_above,
     legend_below as legend_below,
@@ -42,6 +41,7 @@ from .figures import (
     save as save,
     set_title as set_title,
     verify_figure as verify_figure,
+    wrap_label as wrap_label,
 )
 from .handover_descriptions import rehearsal_words as rehearsal_words
 from .html import (
@@ -56,7 +56,12 @@ from .motion_view import (
     motion_scene as motion_scene,
     write_motion_page as write_motion_page,
 )
-from .pages import REPORT as REPORT, folder_pictures as folder_pictures, write_report as write_report
+from .pages import (
+    REPORT as REPORT,
+    folder_pictures as folder_pictures,
+    provenance as provenance,
+    write_report as write_report,
+)
 from .plain_text import PIPE_WIDTH as PIPE_WIDTH, text_parts as text_parts, text_table as text_table
 from .results import (
     Account as Account,
@@ -65,6 +70,7 @@ from .results import (
     ShownCampaign as ShownCampaign,
     ShownComparison as ShownComparison,
     ShownDesign as ShownDesign,
+    ShownDrive as ShownDrive,
     ShownEstimate as ShownEstimate,
     ShownLog as ShownLog,
     ShownPrediction as ShownPrediction,
@@ -72,6 +78,7 @@ from .results import (
     ShownSlip as ShownSlip,
     ShownVerification as ShownVerification,
     drive_frame as drive_frame,
+    joints_frame as joints_frame,
     rows_frame as rows_frame,
 )
 from .slip_figure import slip_figure as slip_figure

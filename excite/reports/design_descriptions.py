@@ -36,7 +36,9 @@ def describe_design(s: Summary) -> Description:
     kept = s["max_violation"] <= TOLERANCE
     over = describe_violations(s.get("violations", {}), s.get("excesses")) or format_percent(100 * s["max_violation"])
     limits = "every limit is kept" if kept else f"limits broken: {over}"
-    driven = "Driven by a steady person" if s.get("driver") else "Driven as designed"
+    word = "motion" if s.get("trajectory") else "drive"
+    driven = "Followed as designed" if s.get("trajectory") else "Driven as designed"
+    driven = "Driven by a steady person" if s.get("driver") else driven
     headline = (
         f"{driven}, these {s['duration_s']:g} s identify every parameter to {format_percent(sigma[worst])} or better"
         f" (one standard deviation, Cramer-Rao bound; worst {worst}, median"
@@ -51,7 +53,7 @@ def describe_design(s: Summary) -> Description:
     if lowest:
         remarks.append(
             f"The lowest cond(Phi) found is {format_number(lowest['cond_phi'], 4)}, with {lowest['worst_parameter']}"
-            f" to {format_percent(lowest['worst_percent'])}; this drive is the most accurate one within"
+            f" to {format_percent(lowest['worst_percent'])}; this {word} is the most accurate one within"
             f" {format_percent(s['cond_slack_percent'], 3)} of it (`--cond-slack 0` gives the other)."
         )
     other = s.get("most_accurate")
@@ -64,8 +66,8 @@ def describe_design(s: Summary) -> Description:
         b = s["bound"]
         what = "the worst parameter" if b["of"] == "worst" else "worst and mean parameter (geometric mean)"
         remarks.append(
-            f"No drive of this problem identifies {what} better than {format_percent(b['certified_percent'], 3)}"
-            f" (numerical bound): this drive attains {format_percent(b['attained_percent'], 3)},"
+            f"No {word} of this problem identifies {what} better than {format_percent(b['certified_percent'], 3)}"
+            f" (numerical bound): this {word} attains {format_percent(b['attained_percent'], 3)},"
             f" {format_percent(b['gap_percent'])} above it."
         )
     if s.get("prediction"):
@@ -78,7 +80,7 @@ def describe_design(s: Summary) -> Description:
     remarks += _describe_given_zeros(s)
     remarks += describe_outside_law(s.get("share_outside_law"))
     if not s["complete"]:
-        remarks.append("Cut short: this is the best drive so far, more time may find a better one.")
+        remarks.append(f"Cut short: this is the best {word} so far, more time may find a better one.")
     if s.get("advice"):
         remarks.append(s["advice"])
     remarks = [*payload_remarks(s), *remarks]
@@ -106,13 +108,14 @@ def describe_design(s: Summary) -> Description:
     if s.get("violations"):
         tables += _violations_table(s)
     return Description(
-        f"Test drive for {s['machine']}, problem {s['problem']}", headline, tuple(tables), tuple(remarks)
+        f"Test {word} for {s['machine']}, problem {s['problem']}", headline, tuple(tables), tuple(remarks)
     )
 
 
 def _ends_table(s: Summary) -> list[Table]:
     """Table of the drives between lowest cond(Phi) and highest accuracy, to choose from; none without others."""
-    ends = {"lowest cond(Phi), --cond-slack 0": s.get("lowest_cond"), "this drive": s}
+    word = "motion" if s.get("trajectory") else "drive"
+    ends = {"lowest cond(Phi), --cond-slack 0": s.get("lowest_cond"), f"this {word}": s}
     ends["for accuracy, --objective accuracy"] = s.get("most_accurate")
     rows = tuple(
         (
@@ -127,8 +130,8 @@ def _ends_table(s: Summary) -> list[Table]:
     )
     if len(rows) < 2:
         return []
-    caption = "Drives to choose from: a low cond(Phi), or small errors; standard deviations in per cent."
-    return [Table(caption, ("drive", "cond(Phi)", "worst parameter", "worst [%]", "median [%]"), rows)]
+    caption = f"{word.capitalize()}s to choose from: a low cond(Phi), or small errors; standard deviations in per cent."
+    return [Table(caption, (word, "cond(Phi)", "worst parameter", "worst [%]", "median [%]"), rows)]
 
 
 def _unseen_collisions(s: Summary) -> str:

@@ -20,7 +20,7 @@ from excite import diagnosis
 from excite.diagnosis import Diagnosis, LogResiduals, TorqueDiagnosis
 from excite.model import signal_descriptions
 from excite.reports.charts import EXPLORE, Explorable
-from excite.reports.figure_files import layout_width, wrap_title
+from excite.reports.figure_files import layout_height, layout_width, wrap_title
 from excite.reports.figures import (
     COLOURS,
     TITLE_SIZE,
@@ -46,6 +46,7 @@ INSET = 0.62, 0.42, 0.1, 0.14  # room for labels: left, below, right, above
 HEAD = 0.28  # above the panels of one torque or force
 EDGE = 0.35  # for the title, and for the legend
 SIGNAL_LETTERS, SIGNAL_LETTERS_NARROW = 40, 26  # of a signal's name in a line; chosen
+LEAST_SHARE = 0.87  # of the height of a course and its map, that their texts need; chosen
 MAP_IN = 2.0  # height of a map below a course over time; chosen
 MISSING_LETTERS = 36  # of the label of a missing torque in a line; chosen
 MAP_INTERVALS = 3  # between ticks of speed, at most; chosen
@@ -139,21 +140,24 @@ def clearest_figure(before: LogResiduals, after: LogResiduals | None, title: str
 def misfit_figure(before: LogResiduals, after: LogResiduals | None, title: str) -> Figure:
     """Plot the largest missing torques and forces against the state of the machine, and their spectra.
 
-    A thick frame marks the quantity on which a torque depends most clearly. A narrow figure shows one torque.
+    A thick frame marks the quantity on which a torque depends most clearly. In print it has the torques that fit on a
+    page.
     """
     evidence = _evidence(before)
     rows = sorted(evidence, key=lambda row: -max(evidence[row].values()))[:MAX_ROWS]
     width = layout_width(MAX_COLUMNS * PANEL[0])
-    rows = rows[:1] if is_narrow(MAX_COLUMNS * PANEL[0]) else rows
     columns = max(1, min(MAX_COLUMNS, int(width / MIN_PANEL_IN)))
-    panel = width / columns, PANEL[1]
     panels = max(sum(row in v for _, v in before.quantities.values()) for row in rows) + 1
-    block = HEAD + -(-panels // columns) * panel[1]
+    lines = -(-panels // columns)
     figure = Figure(figsize=(width, 1.0))
     head = EDGE + TITLE_LINE_IN * wrap_title(figure, title, TITLE_SIZE).count("\n")
     key = _key(before, after, rows)
     side_by_side = legend_columns(key[1], width)
     foot = EDGE + TITLE_LINE_IN * (-(-len(key[1]) // side_by_side) - 1)
+    room = layout_height(np.inf) - head - foot
+    panel = width / columns, min(PANEL[1], (room - HEAD) / lines)
+    block = HEAD + lines * panel[1]
+    rows = rows[: int(min(len(rows), room / block))]
     height = len(rows) * block + head + foot
     figure.set_figheight(height)
     set_title(figure, title, y=1 - head / 2 / height, va="center")
@@ -242,7 +246,8 @@ def when_figure(
     signals = [wrap_label((words or {}).get(n, n), letters) for n in before.sensors]
     block = max(m * (0.1 + 0.16 * max(1 + one.count("\n") for one in signals)), 1.6) + 0.6
     if narrow:
-        figure = new_figure(12, (block + MAP_IN) * len(shown) + 0.8)
+        height = (block + MAP_IN) * len(shown) + 0.8
+        figure = new_figure(12, height, LEAST_SHARE * height)
         every: Any = figure.subplots(2 * len(shown), 1, height_ratios=(block, MAP_IN) * len(shown))
         axes = every.reshape(len(shown), 2)
     else:
@@ -261,7 +266,7 @@ def when_figure(
         ax.set_yticks(np.arange(m) + 0.5, signals, fontsize=8)
         ax.invert_yaxis()
         heading = f"when, in which signal {f'({kind})' if kind else ''}"
-        ax.set_title(wrap_label(heading, 30 if narrow else 60), fontsize=9, loc="left")
+        ax.set_title(wrap_label(heading, 38 if narrow else 60), fontsize=9, loc="left")
         _map(axes[k, 1], course, norm)
         for each in axes[k]:
             each.tick_params(labelsize=8)

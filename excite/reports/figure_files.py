@@ -30,6 +30,7 @@ MM_PER_INCH = 25.4  # definition
 UNITS_MM = {"mm": 1.0, "cm": 10.0}
 WIDTH = re.compile(r"(\d+(?:\.\d*)?)\s*(mm|cm)")
 MIN_WIDTH_MM, MAX_WIDTH_MM = 60.0, 420.0  # narrower than a column of any paper; long side of A3
+MAX_HEIGHT_MM = 240.0  # of a figure in print: the text of an A4 page
 SCREEN_DPI, PRINT_DPI = 160, 300  # of a PNG without and with a stated width; chosen
 MIN_LETTERS_PT = 6.0  # smallest letters that journals print; chosen from guides that ask for 5 to 8 pt
 SMALLEST_PT = 8.0  # smallest letters of a figure on the screen, which are scaled to MIN_LETTERS_PT in print
@@ -99,6 +100,15 @@ def layout_width(own: float) -> float:
     """
     width_mm = (_files.get() or FigureFiles()).width_mm
     return own if width_mm is None else width_mm / MM_PER_INCH * SMALLEST_PT / MIN_LETTERS_PT
+
+
+def layout_height(own: float, least: float = 0.0) -> float:
+    """Return the height [in] at which a figure is drawn: its own on the screen, in print at most that of a page.
+
+    least [in]: that its texts need.
+    """
+    page = MAX_HEIGHT_MM / MM_PER_INCH * SMALLEST_PT / MIN_LETTERS_PT
+    return own if (_files.get() or FigureFiles()).width_mm is None else min(own, max(page, least))
 
 
 def write_figure(figure: Figure, path: Path) -> None:

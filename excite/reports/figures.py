@@ -18,7 +18,7 @@ from excite.identification import Estimate, Prediction, SignalComparison, Verifi
 from excite.logs import Inspection
 from excite.model import Model, signal_descriptions
 from excite.reports.charts import EXPLORE, Explorable, explorable
-from excite.reports.figure_files import POINTS_PER_INCH, layout_width, wrap_title, write_figure
+from excite.reports.figure_files import POINTS_PER_INCH, layout_height, layout_width, wrap_title, write_figure
 
 # Okabe-Ito colours, distinct for the colour-blind; line styles are distinct in black and white.
 RECORDED = "0.6"  # grey of readings as recorded
@@ -27,8 +27,11 @@ MIN_SHADE = 0.004  # of a log's duration, that is shaded at least
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)))
 LINEAR_UP_TO = 5.0  # errors [%] up to which their axis is linear; chosen
+UNIT = re.compile(r"\[[^\]]*\]")  # at the end of a label
+NO_BREAK = "\N{NO-BREAK SPACE}"
 UNIT_OF_COLUMN = re.compile(r"_(Nm|N|(rad|m)(_s)?)$")  # at the end of a profile's columns
 TITLE_SIZE = 11  # pt; chosen
+MIN_LETTERS = 8  # of a label in a line; chosen
 LETTER = 0.58  # width of a letter as a share of its size, on average
 LEGEND_HANDLE = 38.0  # pt, of an entry of a legend without its letters; chosen
 NARROW_IN = 7.0  # width of a figure below which its plots are above each other; chosen
@@ -36,9 +39,9 @@ ROW_IN, MAX_ROWS = 0.22, 36  # height of a row of a table of points, and rows of
 LABEL_LETTERS = 22  # of an axis label in a line; chosen
 TICKED_IN = 2.4  # width of a figure for each decade of errors from which it has ticks between powers of ten; chosen
 ROOMY_ROWS = 24  # of a table of errors, up to which rows are far apart; chosen
-MAX_MATRIX_IN, COLOUR_BAR_IN, CELL_IN = 12.0, 1.1, 0.15  # of a matrix: width, its colour bar, smallest cell; chosen
+MAX_MATRIX_IN, COLOUR_BAR_IN, CELL_IN = 12.0, 1.1, 0.13  # of a matrix: width, its colour bar, smallest cell; chosen
 ONE_COLUMN_OF_SIGNALS = 3  # with their residuals, that are drawn below each other; chosen
-LABEL_LETTERS_NARROW, CHANNEL_LETTERS = 20, 20  # of an axis label in a line, of a channel's in a log; chosen
+CHANNEL_LETTERS = 20  # of a channel's label in a line; chosen
 
 
 def save(figure: Figure, path: Path) -> Explorable:
@@ -61,9 +64,16 @@ def set_title(figure: Figure, text: str, **place: Any) -> None:
     figure.suptitle(escape_dollar(wrap_title(figure, text, TITLE_SIZE)), fontsize=TITLE_SIZE, **place)
 
 
+class LabelWrapper(textwrap.TextWrapper):
+    """Breaks lines at spaces and after the parts of paths and names, but not within a unit."""
+
+    wordsep_simple_re = re.compile(r"([ \n]+|(?<=[/_]))")
+
+
 def wrap_label(text: str, letters: int = LABEL_LETTERS) -> str:
     """Return the label of an axis in lines of so many letters."""
-    return escape_dollar("\n".join(textwrap.wrap(text, letters)))
+    whole = UNIT.sub(lambda unit: unit[0].replace(" ", NO_BREAK), text)
+    return escape_dollar("\n".join(LabelWrapper(letters, break_on_hyphens=False).wrap(whole)))
 
 
 def line_style(k: int) -> dict[str, Any]:
@@ -71,9 +81,14 @@ def line_style(k: int) -> dict[str, Any]:
     return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[k % len(STYLES)]}
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure [in], as wide as `layout_width` says."""
-    return Figure(figsize=(layout_width(width), height), layout="constrained")
+def new_figure(width: float, height: float, least: float = 0.0) -> Figure:
+    """Return an empty figure [in], as wide and high as `layout_width` and `layout_height` say. least: for its texts."""
+    return Figure(figsize=(layout_width(width), layout_height(height, least)), layout="constrained")
+
+
+def letters_along(inches: float, most: int) -> int:
+    """Return how many letters of the smallest size an axis of this length has room for, `most` at most."""
+    return max(MIN_LETTERS, min(most, int(inches * POINTS_PER_INCH / (LETTER * 8))))
 
 
 def is_narrow(width: float) -> bool:
@@ -224,7 +239,7 @@ def budget_figure(estimate: Estimate, title: str) -> Figure:
         for source, share in shares.items():
             largest[source] = max(largest.get(source, 0.0), share)
     shown = sorted((s for s in largest if s != "noise"), key=lambda s: -largest[s])[: len(COLOURS) - 1]
-    figure = Figure(figsize=(7.5, 1.8 + 0.3 * len(budget)), layout="constrained")
+    figure = new_figure(7.5, 1.8 + (0.3 if len(budget) <= ROOMY_ROWS else ROW_IN) * len(budget))
     set_title(figure, title)
     ax = figure.subplots()
     places, left = np.arange(len(budget))[::-1], np.zeros(len(budget))
@@ -236,7 +251,8 @@ def budget_figure(estimate: Estimate, title: str) -> Figure:
     ax.set_yticks(places, list(budget))
     ax.set_xlim(0, 100)
     ax.set_xlabel("share of the variance [%]")
-    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+    ax.tick_params(axis="y", labelsize=8)
+    legend_below(figure, *ax.get_legend_handles_labels())
     return figure
 
 
@@ -284,16 +300,17 @@ def comparison_figure(model: Model, c: SignalComparison, title: str) -> Figure:
     words = signal_descriptions(model.machine)
     for name, b in zip(model.inputs, model.machine.actuated, strict=True):
         words[name] = f"{'torque' if b.joint == 'revolute' else 'force'}, {b.where.replace('_', ' ')}"
-    letters = LABEL_LETTERS_NARROW if is_narrow(own) else LABEL_LETTERS
+    letters = letters_along(0.6 * (float(figure.get_figheight()) - 1.0) / rows - 0.2, LABEL_LETTERS)
     for k, (name, unit) in enumerate(zip(c.names, c.units, strict=True)):
         above, below = axes[2 * (k % rows) : 2 * (k % rows) + 2, k // rows]
         label = wrap_label(words.get(name, name), letters)
-        draw_lines(above, c.t, {"measured": c.measured[k], "predicted": c.predicted[k]}, f"{label}\n[{unit}]", room)
+        key = room if k % rows == 0 else None  # once in a column
+        draw_lines(above, c.t, {"measured": c.measured[k], "predicted": c.predicted[k]}, f"{label}\n[{unit}]", key)
         below.axhline(0, color="black", linewidth=0.6)
         if c.expected is not None:
             band = 1.96 * c.expected[k]
             below.fill_between(c.t, -band, band, color="0.8", linewidth=0, label="95 % if the model is right")
-        draw_lines(below, c.t, {"residual": c.residual[k]}, f"residual\n[{unit}]", None if c.expected is None else room)
+        draw_lines(below, c.t, {"residual": c.residual[k]}, f"residual\n[{unit}]", None if c.expected is None else key)
         below.tick_params(labelbottom=k % rows == rows - 1 or k == n - 1)
     for ax in axes.T.ravel()[2 * n :]:
         ax.set_visible(False)
@@ -313,42 +330,43 @@ def _small_ticks(figure: Figure) -> None:
 def prediction_figure(p: Prediction, title: str) -> Figure:
     """Plot each predicted signal with its 95 % band, and the band alone below, about the residual along a log.
 
-    Torques take the whole width; a motion has a column of speeds and one of positions.
+    Torques take the whole width but in narrow figures; a motion has a column of speeds and one of positions.
     """
     forces = [k for k, unit in enumerate(p.units) if unit in ("N m", "N")]
     motion = [k for k in range(len(p.names)) if k not in forces]
     own = 12.0 if motion else 10.0
     narrow, half = is_narrow(own), len(motion) // 2
-    rows = [[k] for k in (*forces, *motion)] if narrow else [[k] for k in forces]
-    if not narrow:
-        rows += [[motion[k], motion[half + k]] for k in range(half)]
+    several = 2 if narrow and len(p.names) > ONE_COLUMN_OF_SIGNALS else 1
+    rows = [forces[k : k + several] for k in range(0, len(forces), several)]
+    rows += [[motion[k], motion[half + k]] for k in range(half)]
     figure = new_figure(own, 0.8 + (2.2 if narrow else 3.0) * len(rows))
+    letters = letters_along(0.6 * (float(figure.get_figheight()) - 0.8) / len(rows) - 0.2, LABEL_LETTERS)
     set_title(figure, title)
     grid = figure.add_gridspec(2 * len(rows), 2, height_ratios=(2, 1) * len(rows))
     for i, row in enumerate(rows):
         for j, k in enumerate(row):
-            column = slice(None) if len(row) == 1 else j
+            column = j if len(row) > 1 or several > 1 else slice(None)
             above = figure.add_subplot(grid[2 * i, column], sharex=figure.axes[0] if figure.axes else None)
             below = figure.add_subplot(grid[2 * i + 1, column], sharex=above)
             above.tick_params(labelbottom=False)
-            _predicted(above, below, p, k, float(figure.get_figwidth()) / len(row) - 1.0)
+            _predicted(above, below, p, k, letters, float(figure.get_figwidth()) / len(row) - 1.0 if i == 0 else None)
             if i == len(rows) - 1:
                 below.set_xlabel("time [s]")
     _small_ticks(figure)
     return figure
 
 
-def _predicted(above: Axes, below: Axes, p: Prediction, k: int, room: float) -> None:
+def _predicted(above: Axes, below: Axes, p: Prediction, k: int, letters: int, room: float | None) -> None:
     """Plot the k-th signal of a prediction with its band above; below the band alone, or the residual in it.
 
-    room [in]: of a legend.
+    letters: of a label in a line. room [in]: of a legend; None without one.
     """
     unit, added = p.units[k], " (adds up)" if p.names[k] in p.free else ""
     above.fill_between(p.t, p.value[k] - p.band[k], p.value[k] + p.band[k], color=COLOURS[4], alpha=0.5, linewidth=0)
     curves = {"predicted": p.value[k]}
     if p.measured is not None:
         curves = {"measured": p.measured[k], **curves}
-    label = wrap_label(f"{UNIT_OF_COLUMN.sub('', p.names[k])} [{unit}]{added}", LABEL_LETTERS)
+    label = wrap_label(f"{UNIT_OF_COLUMN.sub('', p.names[k])} [{unit}]{added}", letters)
     draw_lines(above, p.t, curves, label, room if len(curves) > 1 else None)
     below.grid(alpha=0.3)
     below.axhline(0, color="black", linewidth=0.6)
@@ -362,7 +380,8 @@ def _predicted(above: Axes, below: Axes, p: Prediction, k: int, room: float) -> 
     below.plot(p.t, residual, color=COLOURS[0], linewidth=1.0, label="measured - predicted")
     below.plot(p.t[outside], residual[outside], ".", color=COLOURS[1], markersize=3, label="outside")
     below.set_ylabel(f"residual\n[{unit}]")
-    legend_above(below, room)
+    if room is not None:
+        legend_above(below, room)
 
 
 def log_figure(found: Inspection, title: str) -> Figure:
@@ -377,6 +396,7 @@ def log_figure(found: Inspection, title: str) -> Figure:
     columns = 1 if count <= ONE_COLUMN or is_narrow(15.5) else 2
     rows = -(-count // columns)
     figure = new_figure(5.5 + 5 * columns, 1.3 + 1.3 * rows)
+    letters = letters_along((float(figure.get_figheight()) - 1.3) / rows - 0.1, CHANNEL_LETTERS)
     set_title(figure, title)
     axes = figure.subplots(rows, columns, sharex=True, squeeze=False).T.ravel()
     for ax, (name, (t, values, unit)) in zip(axes, found.signals.items(), strict=False):
@@ -390,7 +410,7 @@ def log_figure(found: Inspection, title: str) -> Figure:
                 ax.axvspan(middle - width / 2, middle + width / 2, color=COLOURS[1], alpha=0.35, linewidth=0)
         for gap in found.gaps:
             ax.axvline(gap, color="black", linewidth=0.8, linestyle="--")
-        ax.set_ylabel(wrap_label(f"{name} [{unit}]", CHANNEL_LETTERS), fontsize=8)
+        ax.set_ylabel(wrap_label(f"{name} [{unit}]", letters), fontsize=8)
         ax.tick_params(labelsize=8)
         ax.grid(alpha=0.3)
     for ax in axes[count:]:

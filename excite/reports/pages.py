@@ -35,6 +35,10 @@ CAPTIONS = {
     " difference or sum far better than each of them.",
     "prior.png": "What the machine file calls known and what the log adds: grey, the 95 % interval before the log,"
     " diamonds and bars the estimate and its 95 % interval, all in standard deviations known before.",
+    "budget.png": "What makes the variance of each parameter: noise with what the model lacks, and the tolerances of"
+    " the machine file. What takes a large share is worth measuring.",
+    "curves.png": "The torque that the model lacks in each joint as a function of one signal: mean, and its 95 % band."
+    " Flat at zero is right.",
     "log.png": "Every channel that the machine file knows, in SI units, over time: as recorded, and as it is used after"
     " repair and resampling.",
     "signals.png": "Left, the share of each signal's error that is systematic, the rest being noise. Right, the error"
@@ -50,6 +54,12 @@ CAPTIONS = {
     " steered joint at its stop.",
     "study.png": "Cell by cell: each parameter's error, root mean square over the cell's runs [%], and the share of 95"
     " % intervals that hold; or the verdicts of diagnosis; or the drives' condition numbers.",
+}
+ARM_CAPTIONS = {  # of motions that a position controller follows
+    "design.png": "The motion: torques in per cent of their limits, speeds and angles of the joints over time, dotted"
+    " lines the limits; the most used share of each limit, in per cent. Torques that swing fast have an excerpt.",
+    "sigma.png": "Attainable accuracy of the motion: one standard deviation (Cramer-Rao bound, all sensors together) of"
+    " every parameter in per cent of its nominal value, on a logarithmic axis.",
 }
 ZOOM = " On the screen: drag to zoom, point to read values, the arrows go back; names hide curves."
 FOLDED = {  # figures that a reader opens, by what they are called
@@ -157,6 +167,8 @@ def provenance(summary: Summary, command: str | None = None) -> dict[str, str]:
 
 
 def _caption(name: str, summary: Summary) -> str:
+    if summary.get("trajectory") and name in ARM_CAPTIONS:
+        return ARM_CAPTIONS[name]
     if name in CAPTIONS:
         return CAPTIONS[name]
     kind, _, number = name.removesuffix(".png").partition("-")

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Self, cast
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
@@ -33,7 +34,8 @@ class Account:
     kind: as `describe` takes it. summary: content of summary.json. figures: each by its file name, the main one first.
     files: each writes other files into a folder. drawn: figures more, which `draw` writes into a folder, several at a
     time, returning what of them a chart shows.
-    frame: the numbers as a table, with units in `attrs["units"]`. scene: an arm's motion to look at.
+    frame: the numbers as a table, with units in `attrs["units"]`. joints: of a drive, its joints' motion and torques.
+    scene: an arm's motion to look at.
     """
 
     kind: str
@@ -44,6 +46,7 @@ class Account:
     drawn: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
     draw: Callable[[Path], Mapping[str, Explorable]] | None = None
     scene: Callable[[], dict[str, Any]] | None = None
+    joints: Callable[[], pd.DataFrame] | None = None
 
     def write(self, place: Path, command: str | None = None) -> dict[str, Any]:
         """Fill a folder with files, figures, report.html and summary.json; return the summary.
@@ -87,6 +90,10 @@ class Shown:
 
     def _repr_html_(self) -> str | None:
         return result_fragment(self.description) if "_make_account" in self.__dict__ else None
+
+    def keep_call(self, call: str) -> None:
+        """Keep the call that made this result, which a saved folder records."""
+        self.__dict__["_call"] = call
 
     @property
     def description(self) -> Description:
@@ -141,7 +148,7 @@ class Shown:
         width = None if figure_width is None else figure_files.read_width("figure_width", figure_width)
         files = figure_files.FigureFiles(figure_files.read_formats("figures", figures), width, warn)
         with output.new_folder(out, "folder") as place, figure_files.writing_figures(files):
-            self.account.write(place, f"excite.{CALLS.get(self.account.kind, self.account.kind)}(...) in Python")
+            self.account.write(place, self.__dict__.get("_call", "by hand in Python"))
         return out
 
 
@@ -150,22 +157,39 @@ def warn(line: str) -> None:
     warnings.warn(line, stacklevel=2)
 
 
-CALLS = {"log": "read_log"}  # kinds whose function has another name
-
-
 class ShownLog(Shown, Log):
     """Measurements of a log, checked; fields as in `Log`."""
 
 
-class ShownDesign(Shown, Design):
+class ShownDrive(Shown):
+    """A drive of known accuracy."""
+
+    @property
+    def sigma(self) -> pd.DataFrame:
+        """Attainable standard deviation of each parameter [% of its nominal value], and what the parameter is."""
+        summary = self.summary
+        table = pd.DataFrame({"std_percent": pd.Series(summary["sigma_percent"], dtype=float)}).rename_axis("parameter")
+        table["meaning"] = [summary["meanings"].get(name, "") for name in table.index]
+        table.attrs["units"] = {"std_percent": "%"}
+        return table
+
+
+class ShownDesign(ShownDrive, Design):
     """A designed drive; fields as in `Design`."""
+
+    @property
+    def joints(self) -> pd.DataFrame:
+        """Torque, position and speed of every driven joint over time, units in `attrs["units"]`."""
+        frame = self.account.joints
+        assert frame is not None
+        return frame()
 
 
 class ShownCampaign(Shown, Campaign):
     """Drives designed together; fields as in `Campaign`."""
 
 
-class ShownScore(Shown, Score):
+class ShownScore(ShownDrive, Score):
     """A drive judged as a design; fields as in `Score`."""
 
 
@@ -214,6 +238,24 @@ def rows_frame(rows: Mapping[str, Mapping[str, Any]], index: str) -> pd.DataFram
 
 
 UNITS_OF_ENDS = {"_percent": "%", "_s": "s", "gain_ci95": "%"}  # of columns of a summary
+
+
+def joints_frame(model: Model, motion: Motion) -> pd.DataFrame:
+    """Return torque, position and speed of every driven joint, columns (joint, quantity), over the time [s]."""
+    columns: dict[tuple[str, str], np.ndarray] = {}
+    units: dict[tuple[str, str], str] = {}
+    for k, b in enumerate(model.machine.actuated):
+        turns, at = b.joint == "revolute", model.coordinates.index(b.coordinates[0])
+        for name, values, unit in (
+            ("torque" if turns else "force", motion.u[:, k], "N m" if turns else "N"),
+            ("angle" if turns else "position", motion.q[:, at], "rad" if turns else "m"),
+            ("speed", motion.nu[:, at], "rad/s" if turns else "m/s"),
+        ):
+            columns[b.where, name], units[b.where, name] = values, unit
+    table = pd.DataFrame(columns, index=pd.Index(motion.t, name="t_s"))
+    table.columns.names = ["joint", "quantity"]
+    table.attrs["units"] = units
+    return table
 
 
 def drive_frame(model: Model, motion: Motion) -> pd.DataFrame:

@@ -48,12 +48,8 @@ def draw_machine(ax: Axes, machine: Machine) -> None:
     _contacts(ax, machine, {}, ghost=False)
     _joints(ax, machine, poses)
     _masses(ax, machine, poses)
-    for s in machine.sensor:
-        if s.kind == "wheel":
-            assert s.radius is not None
-            assert s.lateral is not None
-            shape = _footprint(*poses[s.body], float(s.radius), 0.2 * float(s.radius), float(s.lateral))
-            ax.add_patch(Polygon(shape, closed=True, facecolor="none", edgecolor=COLOURS[2], zorder=4))
+    for shape in _wheels(machine):
+        ax.add_patch(Polygon(shape, closed=True, facecolor="none", edgecolor=COLOURS[2], zorder=4))
     ax.set_aspect("equal", adjustable="datalim")
     lines = max((wrap_label(b.where.replace("_", " "), NAME_LETTERS).count("\n") for b in machine.contacts), default=0)
     (left, low), (right, high) = ax.dataLim.get_points()
@@ -93,9 +89,21 @@ def footprints(machine: Machine, q: Mapping[str, float]) -> list[np.ndarray]:
     return shapes
 
 
+def _wheels(machine: Machine) -> list[np.ndarray]:
+    """Return the corners (4, 2) [m] of every measuring wheel, with all joints at zero."""
+    poses = mechanics.body_poses(machine, {})
+    shapes = []
+    for s in machine.sensor:
+        if s.kind == "wheel":
+            assert s.radius is not None
+            assert s.lateral is not None
+            shapes.append(_footprint(*poses[s.body], float(s.radius), 0.2 * float(s.radius), float(s.lateral)))
+    return shapes
+
+
 def _contacts(ax: Axes, machine: Machine, q: Mapping[str, float], ghost: bool) -> None:
     """Draw contacts as rectangles with names; as ghosts only those that moved."""
-    poses, still = mechanics.body_poses(machine, q), footprints(machine, {})
+    poses, still, wheels = mechanics.body_poses(machine, q), footprints(machine, {}), _wheels(machine)
     for b, shape, before in zip(machine.contacts, footprints(machine, q), still, strict=True):
         place = poses[b.index][1]
         if ghost and np.allclose(shape, before):
@@ -108,14 +116,17 @@ def _contacts(ax: Axes, machine: Machine, q: Mapping[str, float], ghost: bool) -
             Polygon(shape, closed=True, facecolor="white" if driven else "0.9", edgecolor="black", alpha=0.9, zorder=3)
         )
         left = place[1] > -1e-6
+        outline = np.concatenate([shape, *(w for w in wheels if w[:, 0].min() < place[0] < w[:, 0].max())])
         ax.annotate(
             wrap_label(b.where.replace("_", " ") + ("" if driven else " (not driven)"), NAME_LETTERS),
-            (place[0], shape[:, 1].max() if left else shape[:, 1].min()),
+            (place[0], outline[:, 1].max() if left else outline[:, 1].min()),
             xytext=(0, 2 if left else -2),
             textcoords="offset points",
             ha="center",
             va="bottom" if left else "top",
             fontsize=8,
+            bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
+            zorder=7,
         )
 
 

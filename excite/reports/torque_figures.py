@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from excite.diagnosis import Curve, TorqueDiagnosis
 from excite.reports.figure_files import layout_width
-from excite.reports.figures import COLOURS, is_narrow, legend_below, new_figure, set_title, wrap_label
+from excite.reports.figures import COLOURS, is_narrow, legend_below, letters_along, new_figure, set_title, wrap_label
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
 MAX_TORQUES = 4  # with the largest errors, in the figure; chosen
@@ -34,6 +34,7 @@ def misfit_of_torques(d: TorqueDiagnosis, title: str) -> Figure:
     order = sorted(range(len(rows)), key=lambda k: -before.level[rows[k]] / before.lowest[rows[k]])[:MAX_TORQUES]
     narrow = is_narrow(10.0)
     figure = new_figure(10.0, 0.9 + (3.4 if narrow else 2.0) * len(order))
+    letters = letters_along((float(figure.get_figheight()) - 0.9) / len(order) / (2 if narrow else 1) - 0.4, 22)
     grid: Any = figure.subplots(len(order) * (2 if narrow else 1), 1 if narrow else 2, squeeze=False)
     axes = grid.reshape(len(order), 2)
     for (over_time, over_speed), k in zip(axes, order, strict=True):
@@ -56,9 +57,9 @@ def misfit_of_torques(d: TorqueDiagnosis, title: str) -> Figure:
             over_speed.plot(at, mean, ".-", color=colour, label=label)
         over_time.axhline(after.lowest[row], color="0.5", linestyle="--", label="sensors' noise")
         over_speed.axhline(0.0, color="0.5", linewidth=0.8)
-        over_time.set_ylabel(wrap_label(f"rms error of {name} [{unit}]"))
+        over_time.set_ylabel(wrap_label(f"rms error of {name} [{unit}]", letters))
         over_time.set_ylim(bottom=0.0)
-        over_speed.set_ylabel(wrap_label(f"mean error of {name} [{unit}]"))
+        over_speed.set_ylabel(wrap_label(f"mean error of {name} [{unit}]", letters))
         signal = f"speed of {body.where.replace('_', ' ')} [{'rad/s' if turns else 'm/s'}]"
         over_speed.set_xlabel(wrap_label(signal, 44), fontsize=9)
     axes[-1, 0].set_xlabel("time [s]" if len(d.sources) == 1 else "time, one log after the other [s]")

@@ -71,7 +71,7 @@ class DesignRequest:
     phase_min_s: float = 3.0
     cond_slack: float = 12.0
     solver: str = "own"
-    of: Path | None = None
+    of: Path | logs.PlannedDrive | None = None
     trajectory: str | None = None
     other_end: bool = True
     payload_kg: float | None = None
@@ -169,7 +169,7 @@ def contrasts(model: Model, request: DesignRequest) -> np.ndarray | None:
         return payload_contrasts(model, request.payload_kg)
     if request.of is None:
         return None
-    drive = logs.read_drive(request.of, model)
+    drive = logs.read_drive(request.of, model) if isinstance(request.of, Path) else request.of
     motion = simulation.play_back(model, drive.torque, drive.q0, drive.nu0, drive.planned)
     return trajectories.prediction_contrasts(model, motion)
 
@@ -485,7 +485,7 @@ def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, 
         by = trajectories.reference_values(result.model)
         variances = trajectories.contrast_variances(C / np.outer(by, by), result.contrasts)
         summary["prediction"] = {
-            "of": str(request.of),
+            "of": str(request.of) if isinstance(request.of, Path) else "the drive",
             "mean_percent": 100 * float(np.sqrt(variances.mean())),
             "max_percent": 100 * float(np.sqrt(variances.max())),
         }

@@ -14,7 +14,7 @@ import pandas as pd
 
 from excite import reports, trajectories
 from excite.errors import MachineError, StoppedError, UsageError
-from excite.logs import profile_of, read_drive, torque_column
+from excite.logs import PlannedDrive, profile_of, read_drive, torque_column
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Problem
 from excite.reports import Account
@@ -104,6 +104,7 @@ def design_account(found: DesignResult, name: str, problem: Problem, request: De
         partial(reports.drive_frame, model, found.design.motion),
         (partial(write_drive, model, found.design.motion),),
         scene=partial(reports.motion_scene, model, found.design.motion) if model.follows_positions else None,
+        joints=partial(reports.joints_frame, model, found.design.motion),
     )
 
 
@@ -119,26 +120,29 @@ def is_own_drive(name: str) -> bool:
 
 
 def read_rivals(
-    option: str, against: Sequence[str], model: Model, problem: Problem
+    option: str, against: Sequence[str | PlannedDrive], model: Model, problem: Problem
 ) -> tuple[tuple[str, ...], dict[str, Score]]:
     """Split what a design is compared with into names of `BASELINES`, and scores of profiles by their files' names.
 
-    option: as an error begins. Raises UsageError for an unknown name or two drives of one name, MachineError for an
-    arm, LogError.
+    option: as an error begins. Drives without a file are called drive 1, drive 2 and so on. Raises UsageError for an
+    unknown name or two drives of one name, MachineError for an arm, LogError.
     """
     if model.follows_positions:
         raise MachineError(
             f"{model.machine.name}: is an arm, and falls under the torques of the usual drives; compare designs by"
             " `excite score` instead"
         )
-    usual = tuple(name for name in against if not is_own_drive(name))
-    files = [Path(name) for name in against if is_own_drive(name)]
+    named = [name for name in against if isinstance(name, str)]
+    usual = tuple(name for name in named if not is_own_drive(name))
+    files = [Path(name) for name in named if is_own_drive(name)]
     for name in usual:
         requests.require_known(option, name, tuple(trajectories.BASELINES))
     twice = sorted({f.name for f in files if [g.name for g in files].count(f.name) > 1})
     if twice:
         raise UsageError(f"{option}: two drives are called {twice[0]}, rename one: a row is named after its file")
+    given = [one for one in against if not isinstance(one, str)]
     drives = {f.name: read_drive(f, model, any_rate=True) for f in files}
+    drives |= {f"drive {k}": one for k, one in enumerate(given, 1)}
     return usual, {
         n: trajectories.score(model, problem, d.torque, d.start, d.nu0, d.planned) for n, d in drives.items()
     }

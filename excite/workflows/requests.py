@@ -113,7 +113,7 @@ def require_known(what: str, value: str, allowed: Sequence[str]) -> None:
         raise UsageError(f"{what}: {value} is unknown, allowed: {', '.join(allowed)}{did_you_mean(value, allowed)}")
 
 
-def require_objective(name: str, machine: Machine, of: Path | None = None) -> None:
+def require_objective(name: str, machine: Machine, of: object = None) -> None:
     """Raise UsageError for an unknown objective, or one without what it needs.
 
     `discrimination` needs two effects that a drive shows; a prediction needs the drive to predict (of), no other does.

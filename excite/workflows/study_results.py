@@ -29,6 +29,7 @@ from excite.workflows.study_runs import DEFECT, DONE, Row
 TABLE, FIGURE = "runs.parquet", "study.png"
 ROW_GROUP = 2000  # rows in memory at a time; chosen
 MIN_SWEPT = 3  # values of a number from which a study has it on an axis; chosen
+CELL_LETTERS, CELL_LETTERS_NARROW = 60, 30  # of a cell's name in a line; chosen
 MAX_NAMED = 30  # cells that the figure names one by one; chosen
 
 COLUMNS = {  # of the table of runs, beside the estimates
@@ -274,19 +275,24 @@ def study_figure(results: Sequence[CellResult], title: str) -> Figure:
     swept = swept_quantity(results)
     if swept is not None and all(s.rms for s in results):
         return _swept_figure(results, *swept, title)
-    names, n = cell_labels(results), len(results)
-    fig = reports.new_figure(11.5, 1.6 + 0.3 * min(n, MAX_NAMED) + (2.5 if n > MAX_NAMED else 0))
+    n, narrow = len(results), reports.is_narrow(11.5)
+    names = [reports.wrap_label(name, CELL_LETTERS_NARROW if narrow else CELL_LETTERS) for name in cell_labels(results)]
+    rows = sum(0.16 + 0.14 * (1 + name.count("\n")) for name in names) if n <= MAX_NAMED else 0.3 * MAX_NAMED + 2.5
+    both = narrow and any(s.rms for s in results)
+    fig = reports.new_figure(11.5, 1.6 + (2 * rows + 0.6 if both else rows))
     reports.set_title(fig, title)
     y = np.arange(n)
     if any(s.rms for s in results):
-        left, right = fig.subplots(1, 2, sharey=True, width_ratios=(2, 1))
+        left, right = fig.subplots(2, 1) if narrow else fig.subplots(1, 2, sharey=True, width_ratios=(2, 1))
         for k, s in enumerate(results):
             if s.rms:
                 left.plot(list(s.rms.values()), [k] * len(s.rms), "o", color=COLOURS[0], markersize=3, alpha=0.5)
                 left.plot(np.median(list(s.rms.values())), k, "D", color=COLOURS[1], markersize=5)
                 right.plot(100 * s.coverage, k, "D", color=COLOURS[1], markersize=5)
         left.set_xscale("log")
-        left.set_xlabel("error of each parameter, rms over the runs [%]; diamond: median parameter")
+        label = "error of each parameter, rms over the runs [%]; diamond: median"
+        left.set_xlabel(reports.wrap_label(label, 34 if narrow else 44))
+        left.xaxis.set_major_formatter("{x:g}")
         right.axvline(95, color="black", linewidth=0.8, linestyle=(0, (2, 3)))
         right.set_xlim(-3, 103)
         right.set_xlabel("95 % intervals that hold [%]")
@@ -297,10 +303,10 @@ def study_figure(results: Sequence[CellResult], title: str) -> Figure:
         for k, kind in enumerate(kinds):
             share = np.array([100 * s.verdicts.get(kind, 0) / max(1, sum(s.statuses.values())) for s in results])
             hatch = ("", "//", "..", "xx")[k]
-            only.barh(y, share, left=base, color=COLOURS[k], hatch=hatch, edgecolor="white", label=kind)
+            only.barh(y, share, left=base, color=COLOURS[k], hatch=hatch, edgecolor="white", label=kind, height=0.6)
             base += share
         only.set_xlabel("verdicts [% of the runs]")
-        only.legend(ncols=4, fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1, 1))
+        reports.legend_below(fig, *only.get_legend_handles_labels())
         axes = [only]
     else:
         only = fig.subplots()
@@ -308,13 +314,15 @@ def study_figure(results: Sequence[CellResult], title: str) -> Figure:
         only.barh(y, score, color=COLOURS[0], height=0.6)
         only.set_xlabel("cond(Phi) of the drive")
         axes = [only]
+    for ax in axes if both else axes[:1]:
+        if n <= MAX_NAMED:
+            ax.set_yticks(y, names, fontsize=8)
+        else:
+            ax.set_ylabel("cell")
+        ax.set_ylim(n - 0.4, -0.6)
     for ax in axes:
         ax.grid(alpha=0.3)
-    if n <= MAX_NAMED:
-        axes[0].set_yticks(y, [reports.escape_dollar(name) for name in names], fontsize=8)
-    else:
-        axes[0].set_ylabel("cell")
-    axes[0].invert_yaxis()
+        ax.tick_params(labelsize=8)
     return fig
 
 

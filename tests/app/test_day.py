@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import time
 from pathlib import Path
@@ -15,8 +16,10 @@ from support.commands import Excite
 from support.drives import drive
 from support.logs import logged
 
+from excite.app.course import draw_course
 from excite.app.day import Day
 from excite.app.key_lines import find_line
+from excite.app.live_view import draw_text
 from excite.logs import SUFFIXES
 from excite.model import Model
 from excite.simulation import simulate
@@ -95,6 +98,11 @@ def test_day_is_read_from_what_the_commands_wrote(
     assert (day.machine, day.logs) == ("mine.toml", ["log.csv"])
     states = {step: day.state(step) for step in ("machine", "design", "drive", "log", "identify")}
     assert states == {"machine": "ready", "design": "waiting", "drive": "waiting", "log": "done", "identify": "ready"}
+    summary = Path("results/checked/summary.json")
+    clean = summary.read_text()
+    summary.write_text(json.dumps(json.loads(clean) | {"doubts": ["the front encoder is coarse"]}))
+    assert Day(Path("results")).state("log") == "doubtful"
+    summary.write_text(clean)
     later = time.time() + 60
     os.utime("mine.toml", (later, later))
     assert day.state("log") == "to do again"
@@ -102,6 +110,49 @@ def test_day_is_read_from_what_the_commands_wrote(
     Path("mine.toml").write_text('extends = "va12_straight"\nname = \n')
     assert "mine.toml" in lacking(day, "design")[0]
     assert not day.ready("log")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("starts", None, ["Starting guesses: a number is needed"]),
+        ("starts", 2.5, ["Starting guesses: must be a whole number (got 2.5)"]),
+        ("duration", -5, ["Length of the drive [s]: must be 1 or more (got -5)"]),
+        ("duration", None, []),
+        ("starts", 3.0, []),
+    ],
+)
+def test_a_wrong_number_is_said_and_never_replaced(tmp_path: Path, key: str, value: object, said: list[str]) -> None:
+    day = Day(tmp_path)
+    day.forms["design"][key] = value
+    assert day.wrong_numbers("design") == said
+    assert day.forms["design"][key] == value
+
+
+def test_the_course_of_a_search_falls_and_ends_now() -> None:
+    assert draw_course([], 5) == draw_course([(1, 40.0)], 5) == draw_course([(0, float("inf")), (1, 40.0)], 5) == ""
+    drawn = draw_course([(0, float("inf")), (1, 100.0), (3, 10.0), (5, 1.0)], 9)
+    points = re.findall(r"([\d.]+),([\d.]+)", drawn.partition("points=")[2])
+    x, y = np.array(points, float).T
+    assert np.all(np.diff(x) >= 0)
+    assert (x[0], x[-1]) == (6, 354)
+    assert np.unique(y) == pytest.approx([6, 35, 64])  # of equal ratios equal steps, the lowest score at the bottom
+    assert "100 at 1 s, 1 now" in drawn
+
+
+def test_a_text_is_drawn_from_above_while_it_is_right(tmp_path: Path) -> None:
+    """What is wrong names the file itself, and no draft stays."""
+    path = tmp_path / "mine.toml"
+    drawing, fault = draw_text('extends = "va12"\nname = "mine"\n', path)
+    assert drawing.startswith("data:image/png;base64,iVBOR")
+    assert fault == ""
+    wide = 'extends = "va12"\nname = "mine"\n[body.front_roll.contact]\nwidth = { value = 3, source = "measured" }\n'
+    assert draw_text(wide, path)[0] not in ("", drawing)
+    drawing, fault = draw_text(wide.replace("width", "widt"), path)
+    assert drawing == ""
+    assert fault.startswith("mine.toml: body[1].contact.widt: no such key here")
+    assert draw_text('extends = "ur10"\nname = "mine"\n', path) == ("", "")
+    assert list(tmp_path.iterdir()) == []
 
 
 TEXT = """\

@@ -19,7 +19,7 @@ from excite.diagnosis import LogResiduals
 from excite.identification import Prediction, Verification
 from excite.logs import SlipTable, inspect, motion_columns, torque_column
 from excite.model import Model, build, signal_descriptions
-from excite.model.machine import load_machine, shipped_machines
+from excite.model.machine import Machine, Problem, load_machine, shipped_machines
 from excite.reports import (
     FigureFiles,
     design_figures,
@@ -31,7 +31,10 @@ from excite.reports import (
     torque_figures,
     writing_figures,
 )
-from excite.simulation import measure, simulate
+from excite.simulation import Motion, measure, simulate
+from excite.workflows import study_results
+from excite.workflows.requests import arm_problems, choose_problem
+from excite.workflows.study_plan import Cell, DriveSpec
 
 LONG = "long names"
 MACHINES = shipped_machines()
@@ -52,11 +55,25 @@ def model_of(name: str) -> Model:
     return long_names() if name == LONG else build(load_machine(name))
 
 
+def has_problem(machine: Machine) -> bool:
+    return bool(machine.problems or arm_problems(machine))
+
+
+def problem_of(machine: Machine) -> Problem:
+    return choose_problem(machine, None, None)[1]
+
+
 def design(model: Model) -> Figure:
-    machine = model.machine
-    torque = np.array([0.3 * float(b.limit.torque or 1.0) for b in machine.actuated]) * np.ones((201, 1))
-    problem = machine.problems[str(machine.problem)] if machine.problem else next(iter(machine.problems.values()))
-    return design_figures.design_figure(model, problem, simulate(model, torque), f"{machine.title}: a drive")
+    """A drive, or sines of the joints of an arm."""
+    machine, limits = model.machine, [float(b.limit.torque or 1.0) for b in model.machine.actuated]
+    if machine.planar:
+        motion = simulate(model, 0.3 * np.array(limits) * np.ones((201, 1)))
+    else:
+        t = np.arange(201) / 100
+        wave = np.sin(7 * t)[:, None]
+        u, q = 0.3 * np.array(limits) * wave, 0.1 * wave * np.ones(len(model.coordinates))
+        motion = Motion(t, q, 7 * q, 49 * q, u, t[:, None], t[:, None])
+    return design_figures.design_figure(model, problem_of(machine), motion, f"{machine.title}: a drive")
 
 
 def sigma(model: Model) -> Figure:
@@ -106,8 +123,7 @@ def verification(model: Model) -> Figure:
 
 def comparison(model: Model) -> Figure:
     machine = model.machine
-    problem = machine.problems[str(machine.problem)] if machine.problem else next(iter(machine.problems.values()))
-    broken = max((bound.name for bound in trajectories.machine_limits(model, problem)), key=len)
+    broken = max((bound.name for bound in trajectories.machine_limits(model, problem_of(machine))), key=len)
     names = (trajectories.DESIGNED, *trajectories.BASELINES, "a/long/path/to/a_drive_of_my_own_on_gravel.csv")
     rows = [
         SimpleNamespace(name=name, cond_phi=17.0 * 3**k, worst_std_percent=0.8 * 2**k, breaks=broken if k % 2 else None)
@@ -223,6 +239,30 @@ def slip(model: Model) -> Figure:
     return slip_figure(fit, None, f"{model.machine.title}: a_single_wheel_test.csv")  # type: ignore[arg-type]
 
 
+def budget(model: Model) -> Figure:
+    """Many sources, of which the largest are drawn."""
+    sources = [
+        f"{kind} of {b.where.replace('_', ' ')}" for b in model.machine.body for kind in ("radius", "torque gain")
+    ]
+    share = dict.fromkeys(sources, 0.9 / len(sources))
+    made: Any = SimpleNamespace(budget={name: {"noise": 0.1, **share} for name in model.base.names})
+    return figures.budget_figure(made, model.machine.title)
+
+
+def study(model: Model, durations: tuple[float, ...], verdicts: bool = False) -> Figure:
+    """Four cells that differ in the length of the drive, or in their effects."""
+    sizes = zip(model.base.names, np.geomspace(0.1, 50, len(model.base.names)), strict=True)
+    errors = {} if verdicts else {name: {"rms_percent": x, "coverage95": 0.94} for name, x in sizes}
+    cells = []
+    for k in range(4):
+        drive = DriveSpec(model.machine.name, "R60", "accuracy", durations[k % len(durations)], (), 1, 0, None)
+        effects = ("torque_offset_drift@front_roll=0.5",) * (k if len(durations) == 1 else 0)
+        cell = Cell(drive, "full", "joint", effects, 0)
+        found = {"clean": 3, "tied": 2} if verdicts else {}
+        cells.append(study_results.CellResult(k, cell, "joint", 17.0, {"done": 5}, {}, errors, (), found))
+    return study_results.study_figure(cells, f"{model.machine.title}: a study, 20 runs")
+
+
 KINDS: dict[str, Callable[[Model], Figure]] = {
     "design": design,
     "sigma": sigma,
@@ -243,6 +283,10 @@ KINDS: dict[str, Callable[[Model], Figure]] = {
     "campaign": campaign,
     "top": lambda m: top_view_figure(m.machine),
     "slip": slip,
+    "budget": budget,
+    "swept study": lambda m: study(m, (10.0, 20.0, 40.0, 80.0)),
+    "study": lambda m: study(m, (60.0,)),
+    "study of verdicts": lambda m: study(m, (60.0,), verdicts=True),
     "curves": lambda m: torque_figures.curves_figure(torques(m), m.machine.title),
 }
 
@@ -252,7 +296,8 @@ KINDS: dict[str, Callable[[Model], Figure]] = {
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_text_is_cut_off_or_lies_on_another(kind: str, width_mm: float | None, machine: str) -> None:
     model = model_of(machine)
-    if (kind in ("design", "compare") and not model.machine.problems) or (kind == "top" and not model.machine.planar):
+    without = {"top": not model.machine.planar, **dict.fromkeys(("design", "compare"), not has_problem(model.machine))}
+    if without.get(kind):
         pytest.skip("has no such figure")
     with warnings.catch_warnings(), writing_figures(FigureFiles(width_mm=width_mm)):
         warnings.simplefilter("error")  # a plot without room
@@ -261,6 +306,8 @@ def test_no_text_is_cut_off_or_lies_on_another(kind: str, width_mm: float | None
     scale = 1.0 if width_mm is None else width_mm / 25.4 / figure.get_figwidth()
     letters = min(t.get_fontsize() for t in figure.findobj(Text) if t.get_text().strip())
     assert scale * letters > (6.0 if width_mm else 8.0) - 0.01
+    most = {None: np.inf, 88.0: 270.0 if machine == LONG else 240.0, 180.0: 240.0}[width_mm]  # text of a page [mm]
+    assert scale * figure.get_figheight() * 25.4 < most + 0.01
 
 
 def test_the_check_finds_what_cannot_be_read() -> None:

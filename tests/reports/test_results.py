@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import markupsafe
 import numpy as np
 import pandas as pd
 import pytest
@@ -21,7 +21,7 @@ from support.commands import Excite
 from support.drives import drive
 
 import excite as ex
-from excite import trajectories, workflows
+from excite import calls, trajectories, workflows
 from excite.errors import FolderError, UsageError
 from excite.model import Model
 from excite.reports import Shown, ShownDesign, describe
@@ -136,6 +136,14 @@ COMMANDS: dict[str, Callable[[Path], tuple[object, ...]]] = {
 }
 
 
+CALLS = {
+    "log": 'excite.read_log("va12_straight", "{}/log.csv")',
+    "score": 'excite.score("va12_straight", "{}/driven/profile.csv")',
+    "identify": 'excite.identify("va12_straight", "{}/log.csv", method="ols")',
+    "verify": 'excite.verify("va12_straight", "{}/driven", runs=2, method="ols")',
+}
+
+
 @pytest.mark.parametrize("kind", COMMANDS)
 def test_a_saved_result_is_the_folder_of_the_command(
     results: dict[str, Shown], place: Path, excite: Excite, tmp_path: Path, kind: str
@@ -152,9 +160,38 @@ def test_a_saved_result_is_the_folder_of_the_command(
     }
     printed = [line.strip() for line in repr(results[kind]).splitlines()]
     assert printed == [line.strip() for line in shown.splitlines()][: len(printed)]
-    assert re.search(r"<code>excite\.\w+\(...\) in Python</code>", own["report.html"].read_text())
+    assert first["command"] == CALLS[kind].format(place)
+    assert f"<code>{markupsafe.escape(first['command'])}</code>" in own["report.html"].read_text()
     for name in set(own) - {"summary.json", "report.html"}:
         assert own[name].read_bytes() == others[name].read_bytes(), name
+
+
+def test_errors_name_arguments_and_commands_keep_their_options(straight: Model) -> None:
+    with pytest.raises(UsageError, match=r"^duration: must be between .* \(got -5\)$"):
+        ex.score(straight, np.zeros((10, 2)), duration=-5)
+    with pytest.raises(UsageError, match=r"^objective prediction: needs of=PROFILE.csv, the drive to predict$"):
+        ex.design(straight, objective="prediction")
+    assert (
+        calls.name_arguments("--sigma-max 5: see `excite design --help`") == "sigma_max 5: see `excite design --help`"
+    )
+
+
+def test_a_call_is_recorded_as_it_is_typed(straight: Model) -> None:
+    """Arguments without a text stand by their names, defaults are left out."""
+    table, own = pd.DataFrame(), replace(straight, machine=straight.machine.model_copy(update={"name": "mine"}))
+    told = calls.format_call(ex.simulate, (own, table), {"effects": ["ground_slope=0.01"], "seed": 0, "noise": False})
+    assert told == 'excite.simulate(machine, drive, noise=False, effects=["ground_slope=0.01"])'
+    assert calls.format_call(ex.campaign, ("emps", {"M": 0.5}), {}) == 'excite.campaign("emps", {"M": 0.5})'
+
+
+def test_joints_and_accuracy_of_a_drive_are_tables(designed: ShownDesign) -> None:
+    joints, sigma = designed.joints, designed.sigma
+    assert list(joints["front_roll"]) == ["torque", "angle", "speed"]
+    assert joints["front_roll"]["torque"].to_numpy() == pytest.approx(designed.motion.u[:, 0])
+    turned = np.gradient(joints["rear_roll"]["angle"], joints.index)
+    assert joints["rear_roll"]["speed"].to_numpy()[5:-5] == pytest.approx(turned[5:-5], abs=0.02)
+    assert joints.attrs["units"]["front_roll", "torque"] == "N m"
+    assert dict(sigma["std_percent"]) == designed.summary["sigma_percent"]
 
 
 def test_a_design_shows_and_saves_itself(designed: ShownDesign, tmp_path: Path) -> None:
