@@ -1,16 +1,21 @@
-"""A name must pay: on withheld data, beside slow unknown forces, with a possible sign; errors of the file are named."""
+"""A name must pay: on withheld data, beside unknown forces, with a possible sign; errors of the file are named."""
 
 import tomllib
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from support.drives import arm_motion
 
 import excite
-from excite.diagnosis import fits, hold_out, selection, slow_forces
+from excite.diagnosis import evidence, fits, hold_out, selection
+from excite.diagnosis.acceptance import reason_against
+from excite.diagnosis.diagnosis import Finding
 from excite.logs import Log, examine, from_table
-from excite.model import build, effects, standard_parameters
+from excite.model import Model, build, effects, standard_parameters
 from excite.model.machine import Machine, load_machine
 
 R60 = Path(__file__).parents[2] / "results" / "R60_accuracy" / "design" / "profile.csv"
@@ -19,7 +24,7 @@ R60 = Path(__file__).parents[2] / "results" / "R60_accuracy" / "design" / "profi
 def errors(log_likelihood: list[float]) -> hold_out.HoldOutErrors:
     n = len(log_likelihood)
     ones = np.ones((n, 1))
-    likelihood = np.array(log_likelihood)[:, None]
+    likelihood = np.array(log_likelihood)
     return hold_out.HoldOutErrors((("q", "rad"),), ones, ones, np.ones(1), np.ones(1), np.zeros(n), likelihood)
 
 
@@ -147,7 +152,14 @@ def test_a_wrong_file_of_an_arm_is_named(true: Machine, scale: float, name: str,
         assert f.magnitude_std < 0.15 * abs(amount)
 
 
-def test_slow_forces_leave_a_true_effect_its_significance_and_take_that_of_a_false_one() -> None:
+def drifts(straight: Model, log: Log) -> tuple[str, ...]:
+    """Names that a log gives to drifts of the front roll's torque."""
+    stage = fits.fit_machine(straight.machine, [log], straight.machine.filter)
+    drifting = [x for x in selection.candidates_of(stage) if x.name == "torque_offset_drift@front_roll"]
+    return tuple(x.name for x in evidence.choose(stage.form(drifting)).candidates)
+
+
+def test_slow_forces_leave_a_true_effect_its_name_and_take_that_of_a_false_one() -> None:
     """A torque offset that drifts steadily, and a slow unknown torque that a steady drift explains in part."""
     straight = build(load_machine("va12_straight"))
     t = np.arange(0, 40, 0.01)
@@ -158,14 +170,29 @@ def test_slow_forces_leave_a_true_effect_its_significance_and_take_that_of_a_fal
     pulled[:, 0] += pull
     false = excite.simulate(straight, pulled, seed=3)
     false["u1_Nm"] -= pull
-    entry = selection.identified_entry("torque_offset_drift", "front_roll", 1.0, {"slowing": 0.0})
-    extended = effects.with_effects(straight.machine, entry)
-    z = {}
-    for name, table in (("true", true), ("false", false)):
-        log = examine(straight.machine, from_table(table, straight.machine, source=name)).log
-        stage = fits.fit_machine(extended, [log], straight.machine.filter)
-        beside = slow_forces.allow_slow_forces(stage)
-        k = stage.model.base.names.index("torque_offset_drift@front_roll")
-        z[name] = beside.X[k] / np.sqrt(beside.covariance[k, k]), stage.fit.X[k] / stage.fit.std[k]
-    assert z["true"][0] > 0.7 * z["true"][1]
-    assert abs(z["false"][0]) < 0.2 * abs(z["false"][1])
+    logs = [examine(straight.machine, from_table(x, straight.machine, source="made")).log for x in (true, false)]
+    assert [drifts(straight, log) for log in logs] == [("torque_offset_drift@front_roll",), ()]
+
+
+@pytest.mark.parametrize(
+    ("kind", "gain", "magnitude", "std", "reason"),
+    [
+        ("cause", 1.0, 400.0, 20.0, ""),
+        ("cause", -1.0, 400.0, 20.0, "it does not predict withheld data better"),
+        ("cause", 1.0, -400.0, 20.0, "its sign is impossible"),
+        ("cause", 1.0, 30.0, 20.0, "its size is uncertain"),
+        ("correction", 1.0, 400.0, 20.0, ""),
+        ("correction", -1.0, 400.0, 20.0, "it does not predict withheld data better"),
+    ],
+)
+def test_a_name_must_pay(straight: Model, kind: str, gain: float, magnitude: float, std: float, reason: str) -> None:
+    """On withheld data: in likelihood as a cause, in its errors as a correction; with a sign and a size that can be."""
+    entry = effects.parse_effect("rolling_resistance@front_roll=400", straight.machine, 40.0)
+    extended = build(effects.with_effects(straight.machine, entry))
+    stage: Any = SimpleNamespace(placed=lambda name: extended.effects[0], dispersion=1.0)
+    found = Finding(entry.name, entry.where, (), 1e-9, magnitude, std, "N", {}, 100.0, kind=kind, std_at_shapes=std)
+    rng = np.random.default_rng(0)
+    before, after = errors([0.0] * 20), errors(list(gain + 0.1 * rng.standard_normal(20)))
+    after = replace(after, squares=after.squares * np.exp(-0.1 * gain))
+    assert reason_against(found, stage, before, after).startswith(reason)
+    assert bool(reason) == bool(reason_against(found, stage, before, after))

@@ -14,11 +14,11 @@ from support.logs import logged, make_log
 
 from excite.diagnosis import count_false_alarms, diagnose, run_forked
 from excite.diagnosis.clean_simulation import MIN_STDS, RUNS, measure_remainder
-from excite.diagnosis.fits import fit_machine, refit
+from excite.diagnosis.fits import fit_machine
 from excite.logs import Log, from_table, read_log
 from excite.model import Model
 from excite.simulation import Motion
-from excite.smoothing import solver
+from excite.smoothing import Lacking, UnknownForces, solver
 
 
 @pytest.fixture(scope="module")
@@ -62,9 +62,11 @@ def test_simulated_logs_are_fitted_from_their_motions_in_few_passes(
     assert len({id(x) for x in passes}) <= 3 * RUNS
 
 
-def test_process_noise_hides_what_is_left(straight: Model, clean: Log) -> None:
+def test_unknown_forces_hide_what_is_left(straight: Model, clean: Log) -> None:
     stage = fit_machine(straight.machine, [clean], straight.machine.filter)
-    assert measure_remainder(refit(straight.machine, stage, 1.0)) is None
+    white = Lacking((), (), 0, np.full(len(stage.data.space.forces), 300.0))
+    beside = replace(stage, fit=replace(stage.fit, unknown=UnknownForces((white,))))
+    assert measure_remainder(beside) is None
 
 
 @pytest.mark.slow
