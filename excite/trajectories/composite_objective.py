@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from excite import smoothing
-from excite.model import Model, with_least_smoothing
+from excite.model import Model
 from excite.simulation import Motion, effect_inputs
 from excite.trajectories import objective as objectives
 from excite.trajectories.arm_bound import arm_bound
@@ -30,7 +30,6 @@ from excite.trajectories.objective import (
 
 CEILING_PRICE = 30.0  # price of a log variance above a ceiling, per unit; chosen
 CEILING_WIDTH = 0.01  # log variance over which that hinge is rounded; chosen
-FRICTION_RATE = 0.08  # rad/s or m/s over which dry friction of arms is smoothed in a search; chosen
 SIGMA_MAX = "sigma-max"  # name of the ceiling among the violations of a drive
 COND_MAX = "cond-max"  # the same of a largest condition number
 
@@ -294,11 +293,6 @@ def motion_bound(model: Model, motion: Motion, noise_factors: Mapping[str, float
     if model.follows_positions and model.plain:
         return arm_bound(model, motion, noise_factors)
     return smoothing.cramer_rao(model, motion, "full", noise_factors=noise_factors)
-
-
-def with_smooth_friction(model: Model) -> Model:
-    """Return the model with dry friction that turns over `FRICTION_RATE` at the fastest."""
-    return with_least_smoothing(model, dict.fromkeys((b.index for b in model.machine.body), FRICTION_RATE))
 
 
 def covariance_bound(objective: CompositeObjective, model: Model, motion: Motion) -> np.ndarray:

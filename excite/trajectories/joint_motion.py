@@ -10,7 +10,7 @@ The program minimises the objective of the information matrix A = sum Phi' Phi o
 with G the gradient of the objective in A, dF = 2 <Phi G, dPhi>.
 
 Dry friction turns within milliseconds at a reversal, too fast for the samples. The program smooths it over
-`FRICTION_RATE` (`with_smooth_friction`); scores and limits of the result are those of the machine file.
+`FRICTION_RATE`; scores and limits of the result are those of the machine file.
 
 Source: Swevers et al., "Optimal robot excitation and identification", IEEE Trans. Robotics and Automation 13, 1997 (the
 Fourier series).
@@ -28,7 +28,7 @@ from scipy.interpolate import BSpline
 from scipy.optimize import minimize
 
 from excite.errors import SimulationError
-from excite.model import Model
+from excite.model import Model, with_least_smoothing
 from excite.model.machine import Problem
 from excite.simulation import Motion, inverse_dynamics, motion_along, play_back
 from excite.trajectories import composite_objective
@@ -48,6 +48,7 @@ from excite.trajectories.limits import (
 HARMONICS = 5  # of a Fourier series; usual in the field
 SPLINE_DEGREE = 5  # torque rates are continuous; chosen
 MAX_SPLINE_PIECES = 60  # of a free motion, which bounds the size of the program; chosen
+FRICTION_RATE = 0.08  # rad/s or m/s over which the program smooths dry friction; chosen
 OBJECTIVE_HZ = 25.0  # rate of the samples of the information in the program; chosen
 LIMITS_HZ = {"fourier": 20.0, "free": 40.0}  # rate of the samples at which the program keeps limits; chosen
 FORCED = ("torque", "torque_rate", "power")  # kinds of limits that another machine on the same path has of its own
@@ -263,6 +264,11 @@ def violations_as_followed(model: Model, problem: Problem, motion: Motion) -> di
         return {FOLLOWING: np.inf}
     names = {g.name for g in machine_limits(model, problem)}
     return {n: x for n, x in check_limits(model, problem, followed).items() if n in names}
+
+
+def with_smooth_friction(model: Model) -> Model:
+    """Return the model with dry friction that turns over `FRICTION_RATE` at the fastest."""
+    return with_least_smoothing(model, dict.fromkeys((b.index for b in model.machine.body), FRICTION_RATE))
 
 
 class MotionProgram:

@@ -23,7 +23,7 @@ from excite.model.machine import Problem
 from excite.simulation import Motion, motion_along
 from excite.trajectories import composite_objective, objective as objectives
 from excite.trajectories.clearance import drive_ranges, random_poses
-from excite.trajectories.composite_objective import COND_MAX, SIGMA_MAX, CompositeObjective, with_smooth_friction
+from excite.trajectories.composite_objective import COND_MAX, SIGMA_MAX, CompositeObjective
 from excite.trajectories.excitation import Manoeuvre
 from excite.trajectories.joint_motion import (
     Basis,
@@ -32,6 +32,7 @@ from excite.trajectories.joint_motion import (
     all_violations,
     motion_basis,
     violations_as_followed,
+    with_smooth_friction,
 )
 from excite.trajectories.limits import (
     LIGHTEN,
