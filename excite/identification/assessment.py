@@ -37,7 +37,7 @@ def estimate_in_full(
 
     exact: the estimate if the model alone explains the logs, for a method that knows any effect: where it raises
     NoEstimateError, tolerances are tried as further parameters of it. find: the method, if exact is None or if no exact
-    fit explains the logs. Raises NoEstimateError, as the method does.
+    fit explains the logs, of a small machine with these parameters as well. Raises NoEstimateError, as the method does.
     """
     small = bool(model.slips) or (exact is not None and len(model.coordinates) <= MOST_JOINTS)
     every = [x for x in tolerances(model.machine) if small or x.effect in CHANNEL_EFFECTS]

@@ -164,14 +164,14 @@ def _build_estimate(
         q, nu, z, u, a = smoothed_motion(space, data, trajectory, fit.X)
         outside.append(outside_law(model, q, nu, fit.X))
         effect_inputs = () if model.plain else (u.T, z.T)
-        beside_forces = (fit.process_noise > 0 or fit.unknown.count > 0) and model.plain
+        beside_forces = fit.process_noise > 0 or fit.unknown.count > 0
         if beside_forces:  # the model alone does not make these accelerations
             a = derivative(nu.T, float(model.machine.sampling_hz)).T
         rows = model.stacked_regressor(q.T, nu.T, a.T, *effect_inputs)
         W.append(rows.reshape(-1, len(fit.X)))
         measured, error = np.zeros((2, len(model.rows), len(u)))
         measured[list(model.actuated)], error[list(model.actuated)] = data.torque.T, -trajectory.sampled_torque_error.T
-        if beside_forces:
+        if beside_forces and model.plain:
             error = measured - model.predict(q.T, nu.T, a.T, model.expand @ fit.X).full()
         Y.append(decimate(measured, filter.decimation))
         errors.append(decimate(error, filter.decimation))
