@@ -81,7 +81,7 @@ def search(before: ExtendedFit, runner: CallRunner, report: ProgressCallback, de
     if before.data.sticks:
         report(0.1, "fitting friction near rest")
         stage = _with_presliding(before, runner)
-    n_candidates, without = 1, dict[str, ExtendedFit | None]()
+    n_candidates, without, idle = 1, dict[str, ExtendedFit | None](), set[str]()
     for turn in range(MAX_TURNS):
         report(0.1 + 0.1 * turn, "scoring effects")
         wanted = [x for x in candidates_of(stage) if x.name not in dropped]
@@ -107,7 +107,7 @@ def search(before: ExtendedFit, runner: CallRunner, report: ProgressCallback, de
         machine = effects.with_effects(stage.machine, *entries(found))
         stage.release()
         try:
-            stage = _without_idle(before, refit(machine, stage), dropped)
+            stage = _without_idle(before, refit(machine, stage), idle, dropped)
         except NotConvergedError:
             break
     report(0.85, "comparing rivals")
@@ -266,10 +266,15 @@ def _without(stage: ExtendedFit, names: Sequence[str]) -> Machine:
     return machine
 
 
-def _without_idle(before: ExtendedFit, stage: ExtendedFit, dropped: dict[str, str]) -> ExtendedFit:
-    """Return a fit without effects whose magnitudes are about zero or that no machine has. Raises NotConvergedError."""
+def _without_idle(before: ExtendedFit, stage: ExtendedFit, idle: set[str], dropped: dict[str, str]) -> ExtendedFit:
+    """Return a fit without effects whose magnitudes are about zero or that no machine has. Raises NotConvergedError.
+
+    One that is idle for the second time is dropped for good.
+    """
     while names := [n for n in added(before, stage) if _is_idle(n, stage) or not is_plausible(n, stage)]:
         dropped.update({n: "its size is impossible" for n in names if not is_plausible(n, stage)})
+        dropped.update({n: "its size is about zero" for n in names if n in idle and n not in dropped})
+        idle.update(names)
         stage = refit(_without(stage, names), stage)
     return stage
 
