@@ -164,7 +164,7 @@ def _build_estimate(
         q, nu, z, u, a = smoothed_motion(space, data, trajectory, fit.X)
         outside.append(outside_law(model, q, nu, fit.X))
         effect_inputs = () if model.plain else (u.T, z.T)
-        beside_forces = fit.process_noise > 0 or fit.unknown.count > 0
+        beside_forces = fit.unknown.count > 0
         if beside_forces:  # the model alone does not make these accelerations
             a = derivative(nu.T, float(model.machine.sampling_hz)).T
         rows = model.stacked_regressor(q.T, nu.T, a.T, *effect_inputs)

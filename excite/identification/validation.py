@@ -214,7 +214,7 @@ def _smoothed_parameter_band(
     Unlike `_parameter_band` it has neither the noise of slips nor the ends of the filter. Raises NotConvergedError.
     """
     X = space.model.nominal
-    linear = linearise_logs(space, [data], [trajectory], [start], X, 0.0)
+    linear = linearise_logs(space, [data], [trajectory], [start], X)
     if linear is None:
         raise NotConvergedError("the smoothed motion can't be linearised")
     n, Z, rate = len(X), linear[0].chain.Z[1:, 1:], float(space.model.machine.sampling_hz)

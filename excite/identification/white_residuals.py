@@ -92,7 +92,7 @@ def white_residuals(
     begin = start if near is None else transfer_trajectory(space, data, near[1], near[0], X)
     fit = fit_logs(space, [data], [begin], X, [start], np.ones(len(X), bool), settings=SMOOTHED)
     trajectory = (fit if fit.linear else fit.required()).trajectories[0]
-    found = linearise_logs(space, [data], [trajectory], [start], X, 0.0)
+    found = linearise_logs(space, [data], [trajectory], [start], X)
     if found is None:
         raise NotConvergedError("the smoothed motion can't be linearised")
     chain, n, n_o = found[0], len(X), len(data.offset_sensors)

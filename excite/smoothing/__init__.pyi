@@ -1,6 +1,5 @@
 from .cramer_rao import cramer_rao as cramer_rao
 from .forward import (
-    PROCESS_NOISE_LEVELS as PROCESS_NOISE_LEVELS,
     interpolate as interpolate,
     state_scale as state_scale,
 )

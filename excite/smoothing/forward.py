@@ -18,9 +18,6 @@ from excite.smoothing.measurements import Measurements, Trajectory, ground_input
 from excite.smoothing.transitions import TransitionJacobians, Transitions, differentiate, integrate
 from excite.smoothing.unknown_forces import Lacking
 
-# Process noise of level 1, white from sample to sample, as acceleration [m/s2, rad/s2]: 500 N on a roller of 11 t.
-PROCESS_NOISE_UNIT = 0.045
-PROCESS_NOISE_LEVELS = (1.0, 4.0, 16.0)  # tried in turn until a fit is close; chosen
 PART_SIZE = 200  # samples whose chain stays in the processor's cache; measured
 
 
@@ -189,9 +186,7 @@ def _direct_slopes(space: StateSpace, at: Evaluation, n_p: int) -> tuple[np.ndar
     return np.concatenate([slopes, by_coefficient, by_offset], axis=2), columns
 
 
-def linearise(
-    space: StateSpace, at: Evaluation, guess: np.ndarray, X: np.ndarray, process_noise: float = 0.0
-) -> LinearisedLog:
+def linearise(space: StateSpace, at: Evaluation, guess: np.ndarray, X: np.ndarray) -> LinearisedLog:
     """Linearise an evaluated log and integrate out its states."""
     data, trajectory, lacking = at.data, at.trajectory, at.lacking
     scale, n_p, n_u, N = state_scale(space), len(X), data.torque.shape[1], len(trajectory.state)
@@ -206,7 +201,7 @@ def linearise(
             parallel_smoother.Elements(zero, first, np.diag(std**2)[None], np.zeros_like(first), zero)
         )
     ]
-    stages, gains, processes, inverses = [], [], [], []
+    stages, gains, inverses = [], [], []
     acting = np.concatenate([np.arange(n_u), n_u + np.flatnonzero(lacking.force_std > 0)])
 
     def readings(part: slice) -> tuple[np.ndarray, np.ndarray]:
@@ -220,7 +215,7 @@ def linearise(
     feedback = feedback_of(space, at)
     for begin in range(0, N - 1, BATCH_SIZE):
         end = min(begin + BATCH_SIZE, N - 1)
-        by = differentiate(space, at.steps.between(begin, end), X, process_noise > 0, bool(lacking.count))
+        by = differentiate(space, at.steps.between(begin, end), X, rising=bool(lacking.count))
         own_feedback = without_growth(space, by, None if feedback is None else feedback[:, begin:end])
         A, inverse = close(space, by, own_feedback)
         A = A * (scale / scale[:, None])
@@ -233,15 +228,11 @@ def linearise(
             at_start, at_end = values[begin:end, None, :], values[begin + 1 : end + 1, None, :]
             change = by.B[:, :, j, None] * at_start + by.rising[:, :, j, None] * (at_end - at_start)
             b[:, :, 1 + n_p + own] += change / scale[:, None]
-        process = np.zeros((end - begin, space.n, 0))
-        if process_noise > 0:
-            process = by.F * (process_noise * PROCESS_NOISE_UNIT * space.forced_inertia) / scale[:, None]
-            processes.append(process)
         if inverse is not None:
             inverse = inverse * (scale / scale[:, None])
             inverses.append(inverse)
-            A, b, gain, process = (inverse @ x for x in (A, b, gain, process))
-        C = gain @ gain.transpose(0, 2, 1) + process @ process.transpose(0, 2, 1)
+            A, b, gain = (inverse @ x for x in (A, b, gain))
+        C = gain @ gain.transpose(0, 2, 1)
         gains.append(gain)
         for k in range(begin, end, PART_SIZE):
             part_end = min(k + PART_SIZE, end)
@@ -274,7 +265,6 @@ def linearise(
         at.beat_inflation,
         acting,
         columns,
-        np.concatenate(processes) if processes else None,
         np.concatenate(inverses) if inverses else None,
     )
 
@@ -340,24 +330,6 @@ def log_variance_slopes(
         weights[:, space.input_columns] = by_input[:, :, : space.core] @ slopes.transpose(0, 2, 1)
         coefficients += at.lacking.along_slopes(weights, at.features[own])
     return found, coefficients
-
-
-@dataclass(frozen=True)
-class ProcessNoise:
-    """What process noise does to a linearised log: G (N - 1, n, n_forced), scaled, by noise of unit variance."""
-
-    G: np.ndarray
-    inverse: np.ndarray
-
-    def split(self, defect: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the cost of the noise in scaled defects (N - 1, n), and what no process noise makes (N - 1, n)."""
-        w = (self.inverse @ defect[:, :, None])[:, :, 0]
-        return float(np.sum(w**2)), defect - (self.G @ w[:, :, None])[:, :, 0]
-
-
-def process_noise_of(linear: LinearisedLog) -> ProcessNoise | None:
-    """Return the process noise of a linearised log; None if it was linearised without any."""
-    return None if linear.process is None else ProcessNoise(linear.process, np.linalg.pinv(linear.process))
 
 
 INITIAL_SPEED_STD = 0.05  # [m/s, rad/s]

@@ -50,7 +50,6 @@ class LinearisedLog:
     beat_inflation (N, m): variance of the readings relative to 1 / weight where encoder errors beat.
     direct_columns: columns of the chain that `direct` belongs to.
     acting (n_e,): places of the white errors in `gain` and `noise` among all torques and forces.
-    process (N - 1, n, n_forced): effect of one standard deviation of process noise on the scaled state, None if none.
     closing (N - 1, n, n): what defects are multiplied by in the chain (`forward.close`), None if by one.
     """
 
@@ -66,7 +65,6 @@ class LinearisedLog:
     beat_inflation: np.ndarray
     acting: np.ndarray
     direct_columns: np.ndarray
-    process: np.ndarray | None = None
     closing: np.ndarray | None = None
 
     @cached_property

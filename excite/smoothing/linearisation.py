@@ -214,8 +214,7 @@ class StateSpace:
     index (n,): places of the states in the simulator's state (q, nu, wheels, z) of size full_size.
     angle_state: for each sensor the state that its encoder reads, -1 for other sensors.
     torque_offsets (n_u, n_base): selects the torque offsets u0 from X.
-    forced_rows: rows on which process noise acts, the unactuated ones, or all if there are none.
-    forced_inertia: nominal inertia of these rows [kg, kg m2].
+    forced_rows: rows without an actuator, or all if there are none, on which forces of effects act.
     reading_parameters: parameters that readings depend on directly.
     initial_std (n,): standard deviation of states whose start is known, NaN for the others.
     readings_use_torque: whether readings depend on the torque at the same sample.
@@ -233,7 +232,6 @@ class StateSpace:
     angle_state: tuple[int, ...]
     torque_offsets: np.ndarray
     forced_rows: tuple[int, ...]
-    forced_inertia: np.ndarray
     reading_parameters: tuple[int, ...]
     initial_std: np.ndarray
     readings_use_torque: bool
@@ -433,7 +431,6 @@ def build_state_space(model: Model, names: tuple[str, ...], forces: bool = False
     seen = substitute_state(_features(model, q, nu))
     t = ca.SX.sym("t")
     channels = model.channels(t, X)
-    mass = ca.Function("mass", [q, u, z, X], [ca.diag(M)])(0, 0, 0, model.nominal).full()[:, 0]
     return StateSpace(
         model,
         sensors,
@@ -444,7 +441,6 @@ def build_state_space(model: Model, names: tuple[str, ...], forces: bool = False
         tuple(angle),
         model.offsets,
         forced_rows,
-        mass[list(forced_rows)],
         reading_parameters,
         initial_std,
         bool(ca.depends_on(reading, u)),

@@ -46,7 +46,7 @@ class Fit:
 
     X (n_base,) [SI], covariance (n_base, n_base) [SI]. unidentifiable (n_base,): parameters held at the machine file's
     values. prior (n_base,): information about these values, scaled. cost: twice the negative log-likelihood.
-    trajectories, linear: of each log. process_noise: level, in units of `forward.PROCESS_NOISE_UNIT`. status, step
+    trajectories, linear: of each log. status, step
     [standard deviations], history: see `solver.Solution`. unknown: what the model lacks. information: of all unknowns,
     scaled; right_side: information times the most likely values, where parameters count from X and coefficients from
     zero.
@@ -59,7 +59,6 @@ class Fit:
     trajectories: tuple[Trajectory, ...]
     linear: tuple[LinearisedLog, ...]
     cost: float
-    process_noise: float
     status: solver.Status
     step: float
     history: tuple[tuple[float, float], ...]
@@ -184,14 +183,12 @@ class LogProblem:
     starts: Sequence[Trajectory]
     prior: np.ndarray
     held: np.ndarray
-    process_noise: float
     unknown: UnknownForces
     pull: Determinant | None = None
     point: Point = field(init=False)
     evaluations: list[Evaluation] = field(init=False)
     linear: tuple[LinearisedLog, ...] = ()
     weights: list[np.ndarray] = field(default_factory=list)
-    process: list[forward.ProcessNoise | None] = field(default_factory=list)
     linearised_coefficients: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @cached_property
@@ -254,7 +251,7 @@ class LogProblem:
         X, self.linear = self.point.X, ()  # both at once take twice the memory
         try:
             linear = tuple(
-                forward.linearise(self.space, e, start.state[0], X, self.process_noise)
+                forward.linearise(self.space, e, start.state[0], X)
                 for e, start in zip(self.evaluations, self.starts, strict=True)
             )
         except np.linalg.LinAlgError:  # the chain is numerically singular this far off
@@ -297,8 +294,7 @@ class LogProblem:
         return values, np.vstack([np.eye(len(X))[free], -self.space.soil, slopes])
 
     def weigh(self, step: np.ndarray) -> None:
-        """Set the weights of the defects from the multipliers of a step, and which of them process noise makes."""
-        self.process = [forward.process_noise_of(log) for log in self.linear]
+        """Set the weights of the defects from the multipliers of a step."""
         new = []
         for log, own in zip(self.linear, self.indices, strict=True):
             multiplier = log.chain.states(step[own])[1][1:]
@@ -311,9 +307,8 @@ class LogProblem:
     def merit(self) -> float:
         """Return cost plus weighted defects at the current point."""
         cost, scale = self.beside_logs()[2], forward.state_scale(self.space)
-        for e, weight, process in zip(self.evaluations, self.weights, self.process, strict=True):
-            noise, defect = (0.0, e.defect / scale) if process is None else process.split(e.defect / scale)
-            cost += e.cost + noise + float(np.sum(weight * np.abs(defect)))
+        for e, weight in zip(self.evaluations, self.weights, strict=True):
+            cost += e.cost + float(np.sum(weight * np.abs(e.defect / scale)))
         return cost
 
     def moved(self, step: np.ndarray) -> Callable[[float], Point]:
@@ -342,7 +337,6 @@ def fit_logs(
     X: np.ndarray,
     starts: Sequence[Trajectory],
     held: np.ndarray,
-    process_noise: float = 0.0,
     settings: Settings = DEFAULT,
     unknown: UnknownForces | None = None,
     pull: Determinant | None = None,
@@ -361,7 +355,7 @@ def fit_logs(
         at = Point(np.where(fixed, space.model.nominal, at.X), at.trajectories)
         prior = prior_information(space.model, fixed, at.X)
         own = None if pull is None else replace(pull, slope=np.where(fixed, 0.0, pull.slope))
-        problem = LogProblem(space, measurements, starts, prior, fixed, process_noise, unknown, own)
+        problem = LogProblem(space, measurements, starts, prior, fixed, unknown, own)
         return problem, solver.minimise(problem, at, how)
 
     fixed, history = held, tuple[tuple[float, float], ...]()
@@ -393,11 +387,10 @@ def linearise_with(
     starts: Sequence[Trajectory],
     held: np.ndarray,
     unknown: UnknownForces,
-    process_noise: float = 0.0,
 ) -> Fit | None:
     """Return the quadratic form of parameters and unknown forces about a point as a fit; None if there is none."""
     prior = prior_information(space.model, held, X)
-    problem = LogProblem(space, measurements, starts, prior, held, process_noise, unknown)
+    problem = LogProblem(space, measurements, starts, prior, held, unknown)
     point = Point(X, tuple(trajectories))
     quadratic = problem.quadratic() if problem.enter(point) else None
     if quadratic is None:
@@ -425,7 +418,6 @@ def _as_fit(
         solution.point.trajectories,
         problem.linear if solution.quadratic is not None else (),
         solution.cost,
-        problem.process_noise,
         status,
         solution.step,
         history,
@@ -472,11 +464,10 @@ def linearise_logs(
     trajectories: Sequence[Trajectory],
     starts: Sequence[Trajectory],
     X: np.ndarray,
-    process_noise: float,
 ) -> list[LinearisedLog] | None:
     """Linearise every log; return None if a mass matrix is not positive or a motion cannot be integrated."""
     unknown, held = no_unknown_forces(space, len(measurements)), np.zeros(len(X), bool)
-    fit = linearise_with(space, measurements, trajectories, X, starts, held, unknown, process_noise)
+    fit = linearise_with(space, measurements, trajectories, X, starts, held, unknown)
     return None if fit is None else list(fit.linear)
 
 
@@ -496,7 +487,7 @@ def newton_step(
     is not positive.
     """
     problem = LogProblem(
-        space, measurements, (), prior, np.zeros(len(X), bool), 0.0, no_unknown_forces(space, len(measurements))
+        space, measurements, (), prior, np.zeros(len(X), bool), no_unknown_forces(space, len(measurements))
     )
     problem.point = Point(X, tuple(trajectories))
     information, slope, cost = problem.beside_logs()

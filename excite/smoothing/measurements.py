@@ -49,7 +49,6 @@ class Measurements:
         do not reduce a reading's weight (the uncertainty counts them). A torque error then acts on its own interval
         alone. If False, readings are weighted by their information: estimates are steadier, and poorly known
         directions are biased by half a standard deviation or more.
-    noise_inflation: factor on the standard deviations of the sensors.
     extra_torque_noise (N - 1, n_u) [N m]: standard deviation that the delivered torque of an interval has beside the
         sensor's noise, or None.
     """
@@ -61,7 +60,6 @@ class Measurements:
     offset_sensors: tuple[int, ...]
     noise: SensorNoise
     unbiased: bool = False
-    noise_inflation: float = 1.0
     extra_torque_noise: np.ndarray | None = None
 
     def until(self, samples: int) -> Measurements:
@@ -328,7 +326,6 @@ def predict_readings(
     inflation = np.where(data.read_at_edges, beat_inflation(travel / count_size, sample), 1.0)
     if not data.unbiased:
         std, inflation = std * np.sqrt(inflation), np.ones_like(inflation)
-    std = std * data.noise_inflation
     sensor_std, std = std, np.hypot(std, _torque_noise_in_readings(space, data, trajectory, u, X))
     inflation = 1 + (inflation - 1) * (sensor_std / std) ** 2
     D = np.zeros((len(space.sensors), len(data.offset_sensors)))

@@ -45,7 +45,7 @@ def quantify_uncertainty(
 
     fit: with exact dynamics. The one-sided standard deviations are those below and above the estimate.
     """
-    linear = linearise_logs(space, measurements, fit.trajectories, starts, fit.X, fit.process_noise)
+    linear = linearise_logs(space, measurements, fit.trajectories, starts, fit.X)
     fit = fit if linear is None else replace(fit, linear=tuple(linear))  # so far it was linearised one step before
     n = len(fit.X)
     none_fixed = np.zeros(n, bool)
@@ -197,7 +197,7 @@ def profile_widths(
                 measurements, fit.trajectories, fit.linear, fit.indices, strict=True
             )
         ]
-        linear = linearise_logs(space, measurements, trajectories, starts, X, fit.process_noise)
+        linear = linearise_logs(space, measurements, trajectories, starts, X)
         if linear is None:
             return 1.0, 1.0
         try:
