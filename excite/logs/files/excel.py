@@ -28,7 +28,7 @@ from excite.logs.files.common import (
 
 BEGIN = 200  # rows in which the header is looked for; chosen
 LONGEST = 1_048_576  # rows of a sheet: Excel's own limit
-UNASKED_BYTES = 50_000_000  # to which a small workbook may unpack; chosen
+UNASKED_BYTES = 20_000_000  # to which a small workbook may unpack, in some ten seconds; chosen
 MOST_TIMES = 60  # its own size to which a larger one may; tables of numbers do to 5 to 30 times; chosen
 BLOCK_CELLS = 500_000  # cells that are read before they become numbers
 NOT_BEFORE = datetime.datetime(1899, 12, 30)  # day 0 of Excel
