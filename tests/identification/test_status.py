@@ -51,9 +51,10 @@ def test_a_good_log_is_valid(va12: Model, table: pd.DataFrame) -> None:
 
 
 @pytest.mark.slow
-def test_a_pull_that_nobody_knows_leaves_doubt(va12: Model, table: pd.DataFrame, tmp_path: Path) -> None:
+def test_a_pull_that_nobody_knows_leaves_doubt(straight: Model, straight_motion: Motion) -> None:
+    table = measure(straight, straight_motion, seed=2)
     pulled = table.assign(u1_Nm=table["u1_Nm"] + 60.0 * (table["t_s"] > 30))
-    ready = prepare(va12, [pulled], needed_sensors(va12, "joint"))
+    ready = prepare(straight, [pulled], needed_sensors(straight, "joint"))
     estimate = identify(ready.model, ready.logs, "joint")
     assert estimate.status == "doubtful"
     assert "does not explain" in estimate.doubt
