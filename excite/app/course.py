@@ -26,7 +26,8 @@ def draw_course(found: Sequence[tuple[float, float]], now: float) -> str:
         points += [f"{EDGE + (t - first) * across:.1f},{EDGE + (high - at) * up:.1f}" for at in (before, y)]
         before = y
     words = f"Best score so far: {math.exp(seen[0][1]):.4g} at {first:.0f} s, {math.exp(seen[-1][1]):.4g} now"
-    return Markup(
+    drawing = Markup(
         '<svg viewBox="0 0 {} {}" width="{}" height="{}" role="img" aria-label="{}"><title>{}</title>'
         '<polyline points="{}" fill="none" stroke="currentColor" stroke-width="2"/></svg>'
-    ).format(WIDTH, HEIGHT, WIDTH, HEIGHT, words, words, " ".join(points))
+    )
+    return str(drawing.format(WIDTH, HEIGHT, WIDTH, HEIGHT, words, words, " ".join(points)))

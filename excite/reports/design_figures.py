@@ -37,7 +37,7 @@ from excite.trajectories import DESIGNED, ComparisonRow, SensorValue
 
 ATTAINABLE = "attainable standard deviation\n[% of the nominal value]"  # label of an axis
 PANEL_IN, PANEL_NARROW_IN, PATH_IN, MIN_DESIGN_IN = 2.3, 1.6, 2.6, 7.5  # heights of panels, and of the figure; chosen
-LEAST_PANEL_IN = 1.25  # of a panel in print; chosen
+LEAST_SHARE, LEAST_SHARE_WITH_PATH = 0.8, 0.88  # of the height of a narrow figure, that its texts need; chosen
 AXIS_IN, BARS_EDGE_IN = 0.9, 0.9  # room for the labels of an axis, and above and below bars; chosen
 LINE_INCHES = 0.165  # of a limit's name; chosen
 LIMIT_LETTERS = 32  # of a limit's name in a line; chosen
@@ -64,7 +64,7 @@ def design_figure(model: Model, problem: Problem, motion: Motion, title: str) ->
     panels_in = (PANEL_NARROW_IN if narrow else PANEL_IN) * len(panels) + 0.6
     path_in = PATH_IN if lane else 0.0
     height = panels_in + bars_in + path_in if narrow else max(panels_in, bars_in + path_in, MIN_DESIGN_IN)
-    figure = new_figure(11.5, height, len(panels) * LEAST_PANEL_IN + bars_in + path_in if narrow else 0.0)
+    figure = new_figure(11.5, height, (LEAST_SHARE_WITH_PATH if lane else LEAST_SHARE) * height if narrow else 0.0)
     if narrow:
         ratios = (panels_in, bars_in + path_in)
         parts: Any = figure.subfigures(2, 1, height_ratios=ratios)
