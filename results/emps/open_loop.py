@@ -131,7 +131,8 @@ def page(rows: dict[str, dict[str, object]], halves: bool) -> str:
         lines += [f"| published: {name} | | {x:g} |" for name, x in PUBLISHED.items()]
     lines += [
         "",
-        "The fits take dry friction as sharp as the machine file, which leaves local minima: another start may end lower.",
+        "The fits take dry friction as sharp as the machine file, which leaves local minima: another start may end"
+        " lower.",
     ]
     return "\n".join(lines) + "\n"
 
