@@ -144,7 +144,7 @@ def readme(found: dict[str, dict[str, object]], own: dict[str, float], late: dic
         "`python results/emps/study.py --out results/emps` rebuilds this page and `methods.json`; [identify](identify)",
         "is the output of `excite identify`. Cells: value (standard deviation). Residual: 100 |Y - W X| / |Y|. Last",
         "four columns: errors of the rig simulated in closed loop from its reference alone, 100 |measured - simulated|",
-        "/ |measured|.",
+        "/ |measured|. [In open loop](open_loop.md) a second log is simulated from its forces, as in the benchmark.",
         "",
         "| method | " + " | ".join(names) + " | residual | position | velocity | acceleration | force |",
         "|---" * (len(names) + 6) + "|",
