@@ -159,6 +159,7 @@ def drifts(straight: Model, log: Log) -> tuple[str, ...]:
     return tuple(x.name for x in evidence.choose(stage.form(drifting)).candidates)
 
 
+@pytest.mark.slow
 def test_slow_forces_leave_a_true_effect_its_name_and_take_that_of_a_false_one() -> None:
     """A torque offset that drifts steadily, and a slow unknown torque that a steady drift explains in part."""
     straight = build(load_machine("va12_straight"))

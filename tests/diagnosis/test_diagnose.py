@@ -593,7 +593,6 @@ def test_what_a_clean_log_does_not_show_goes(straight: Model) -> None:
     for text, seen in (
         ("compaction_per_pass=0.3", False),
         ("torque_deadband@front_roll=20", True),
-        ("stribeck_friction@rear_roll=9", True),
         ("ground_slope=0.001", True),
     ):
         entry = placing.parse_effect(text, straight.machine, 12.0)
