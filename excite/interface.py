@@ -214,6 +214,7 @@ def campaign(
         drives: the most.
         duration: [s] longest of one drive, the problem's if not given.
         within: [s] longest time of all drives.
+        payload: [kg] of an arm, drives without and with a payload whose parameters are to be accurate.
         after: earlier logs, whose information counts.
 
     Returns:

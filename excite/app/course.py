@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 from markupsafe import Markup
 
+from excite.text import format_number
+
 WIDTH, HEIGHT, EDGE = 360, 70, 6  # of the drawing [px]; chosen
 
 
@@ -25,7 +27,8 @@ def draw_course(found: Sequence[tuple[float, float]], now: float) -> str:
     for t, y in (*seen, (now, seen[-1][1])):
         points += [f"{EDGE + (t - first) * across:.1f},{EDGE + (high - at) * up:.1f}" for at in (before, y)]
         before = y
-    words = f"Best score so far: {math.exp(seen[0][1]):.4g} at {first:.0f} s, {math.exp(seen[-1][1]):.4g} now"
+    begun, now_best = (format_number(math.exp(y), 4) for y in (seen[0][1], seen[-1][1]))
+    words = f"Best score so far: {begun} at {first:.0f} s, {now_best} now"
     drawing = Markup(
         '<svg viewBox="0 0 {} {}" width="{}" height="{}" role="img" aria-label="{}"><title>{}</title>'
         '<polyline points="{}" fill="none" stroke="currentColor" stroke-width="2"/></svg>'

@@ -165,8 +165,8 @@ def posterior(
         mean, variance, _, _ = solve(logs)
         square = np.bincount(form.group, mean[:G] ** 2, n)
         determined = count - np.bincount(form.group, variance[:G], n)
-        slope = square - determined - 2 * (logs - logs.mean()) / SIZE_SCATTER**2
-        logs = logs + np.clip(slope / (2 * determined + square + 2 / SIZE_SCATTER**2), -0.7, 0.7)
+        slope = square - determined - (logs - logs.mean()) / SIZE_SCATTER**2
+        logs = logs + np.clip(slope / (2 * determined + square + 1 / SIZE_SCATTER**2), -0.7, 0.7)
     mean, variance, gain, size = solve(logs)
     scatter = float(np.sum((logs - logs.mean()) ** 2)) / SIZE_SCATTER**2 if G else 0.0
     return Posterior(logs, gain - scatter, mean * size, np.sqrt(np.maximum(variance, 0)) * size)

@@ -75,17 +75,21 @@ def assess(
     """
     report, deadline = progress or (lambda share, what: None), deadline or Deadline()
     stages = [d.before, d.after, *(x for x in d.without if x is not None)] if d.findings else [d.before]
-    errors = _hold_out(stages, False, runner, report)
-    seen = [hold_out.hold_out_torques(x) if x.model.slips == () else None for x in stages[:2]]
-    shown = seen if d.findings and None not in seen else errors[:2]
-    beside = iter(errors[2:])
-    pairs = [(None if x is None else next(beside), errors[1]) for x in d.without]
+    likelihood = any(f.kind == "cause" for f in d.findings)  # only these are judged by it
+    seen = [hold_out.hold_out_torques(x) for x in stages]
+    shown = None not in seen
+    errors = seen if shown and not likelihood else _hold_out(stages, likelihood, runner, report)
+    pairs = _pairs(d, errors)
     reasons = [reason_against(f, d.after, *pair) for f, pair in zip(d.findings, pairs, strict=True)]
+    if any(reasons) and errors is not seen:  # withhold every part before a name is given up
+        more = _pairs(d, _hold_out(stages, likelihood, runner, report, True))
+        reasons = [reason_against(f, d.after, *pair) for f, pair in zip(d.findings, more, strict=True)]
     given_up = {f.name: reason for f, reason in zip(d.findings, reasons, strict=True) if reason}
     if given_up:
         return assess(_give_up(d, given_up, runner, deadline), progress, runner, deadline)
-    gains = tuple(hold_out.hold_out_gain(a, b) for a, b in pairs)
-    total_gain = hold_out.hold_out_gain(shown[0], shown[-1])
+    told = seen if shown else errors
+    gains = tuple(hold_out.hold_out_gain(a, b) for a, b in _pairs(d, told))
+    total_gain = hold_out.hold_out_gain(told[0], told[min(1, len(told) - 1)])
     before = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.before))
     after = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.after)) if d.findings else before
     located = d.located
@@ -125,15 +129,27 @@ def _with_remainder(d: Diagnosis, chi2: float) -> Diagnosis:
 
 
 def _hold_out(
-    stages: Sequence[ExtendedFit], every_turn: bool, runner: CallRunner, report: ProgressCallback
+    stages: Sequence[ExtendedFit],
+    likelihood: bool,
+    runner: CallRunner,
+    report: ProgressCallback,
+    every_turn: bool = False,
 ) -> list[HoldOutErrors | None]:
     """Predict withheld stretches with each model, side by side."""
     done = list[HoldOutErrors | None]()
     report(0.0, "measuring the gain")
-    for errors in runner([partial(hold_out.hold_out_errors, s, every_turn, True) for s in stages]):
+    for errors in runner([partial(hold_out.hold_out_errors, s, every_turn, likelihood) for s in stages]):
         done.append(errors)
         report(len(done) / (len(stages) + 1), "measuring the gain")
     return done
+
+
+def _pairs(
+    d: Diagnosis, errors: Sequence[HoldOutErrors | None]
+) -> list[tuple[HoldOutErrors | None, HoldOutErrors | None]]:
+    """Return for each finding the errors without and with it; errors: of the fits before, after, and without each."""
+    beside = iter(errors[2:])
+    return [(None if x is None else next(beside), errors[1]) for x in d.without if len(errors) > 1]
 
 
 def _give_up(d: Diagnosis, reasons: Mapping[str, str], runner: CallRunner, deadline: Deadline) -> Diagnosis:

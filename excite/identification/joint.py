@@ -19,7 +19,7 @@ from excite.identification.combinations import describe_combinations
 from excite.identification.estimate import NOTHING_MOVES_MESSAGE, Discrepancy, Estimate, held_note
 from excite.identification.near_rest import friction_near_rest
 from excite.logs import Log, decimate, derivative
-from excite.model import Model
+from excite.model import Model, nothing_known
 from excite.model.machine import Filter
 from excite.simulation import outside_law
 from excite.smoothing import (
@@ -80,19 +80,34 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
 def joint_exactly(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     """Estimate by joint smoothing if the model alone explains the logs.
 
-    It does if no sensor's innovations are larger than noise and the marginal likelihood says that no force is lacking.
+    It does if no sensor's innovations are larger than noise and the marginal likelihood says that no force is lacking,
+    with what the machine file calls known or, where the log contradicts that, without it.
     Raises UnexplainedError if not.
     """
-    space, measurements, starts, held = _prepare(model, logs, filter)
-    readings = sum(float(data.used.sum()) for data in measurements)
-    limit = Settings(cost_limit=LOST_COST_RATIO * readings)
-    fit = fit_logs(space, measurements, starts, model.nominal, starts, held, settings=limit)
-    close = fit.step <= CLOSE_STEP and not find_suspect_sensors(space, logs, fit)
-    if not close or lacks_forces(space, measurements, starts, held, fit):
+    prepared = _prepare(model, logs, filter)
+    space, measurements, starts, _ = prepared
+    fit, explains = _exact_fit(prepared, logs)
+    if not explains and model.known and fit.linear:
+        free = replace(space, model=replace(model, known=nothing_known(len(model.nominal))))
+        explains = _exact_fit((free, *prepared[1:]), logs)[1]
+    if not explains:
         raise UnexplainedError("the model alone does not explain the log")
     fit, one_sided, flat_notes = quantify_uncertainty(space, measurements, starts, fit)
     notes = (*describe_noise(space, measurements), *flat_notes)
     return _build_estimate(space, measurements, fit, filter, notes, one_sided)
+
+
+Prepared = tuple[StateSpace, Sequence[Measurements], Sequence[Trajectory], np.ndarray]
+
+
+def _exact_fit(prepared: Prepared, logs: Sequence[Log]) -> tuple[Fit, bool]:
+    """Fit the model alone; tell if it explains the logs."""
+    space, measurements, starts, held = prepared
+    readings = sum(float(data.used.sum()) for data in measurements)
+    limit = Settings(cost_limit=LOST_COST_RATIO * readings)
+    fit = fit_logs(space, measurements, starts, space.model.nominal, starts, held, settings=limit)
+    close = fit.step <= CLOSE_STEP and not find_suspect_sensors(space, logs, fit)
+    return fit, close and not lacks_forces(space, measurements, starts, held, fit)
 
 
 def joint_beside_forces(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
@@ -113,9 +128,7 @@ def joint_beside_forces(model: Model, logs: Sequence[Log], filter: Filter) -> Es
     return replace(estimate, doubt=UNEXPLAINED_DOUBT + moving, discrepancy=_discrepancy(missing))
 
 
-def _prepare(
-    model: Model, logs: Sequence[Log], filter: Filter
-) -> tuple[StateSpace, Sequence[Measurements], Sequence[Trajectory], np.ndarray]:
+def _prepare(model: Model, logs: Sequence[Log], filter: Filter) -> Prepared:
     """Return the state space, measurements, first trajectories, and parameters (n_base,) of what is at rest."""
     space = build_state_space(model, common_sensors(model, logs), bool(model.machine.contacts))
     measurements, starts = prepare_logs(space, logs, filter, unbiased=True)

@@ -97,7 +97,7 @@ def commands(command: Any, name: str = "") -> dict[str, Any]:
 def test_every_command_that_draws_takes_the_options() -> None:
     found = {name for name, c in commands(typer.main.get_command(app)).items() if isinstance(c, options.DrawingCommand)}
     without = {*"machines drive simulate handover app docs".split(), "log convert"}
-    without |= {f"machine {name}" for name in ("new", "urdf", "model")}
+    without |= {f"machine {name}" for name in ("new", "around", "urdf", "model")}
     assert found == set(commands(typer.main.get_command(app))) - without
 
 
