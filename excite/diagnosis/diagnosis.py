@@ -196,8 +196,11 @@ def conclude(before: ExtendedFit, found: Search, runner: CallRunner = run_in_tur
     findings = tuple(
         replace(f, share=share * x.likelihood_ratio / gained) for f, x in zip(findings, choices, strict=True)
     )
-    explains = after.exact and not after.impossible and share >= MIN_EXPLAINED_SHARE
-    nearest = None
+    if choices and after.impossible:  # no cause makes a machine impossible, however much it explains
+        impossible = NearestEffect(choices[-1].name, share, after.impossible)
+        return Diagnosis("unexplained", (), before, before, 0.0, anomaly_lines(before), (), impossible)
+    explains = after.exact and share >= MIN_EXPLAINED_SHARE
+    nearest: NearestEffect | None = None
     if choices:
         verdict = "unexplained" if not explains else "tied" if any(f.tied_with for f in findings) else "named"
     else:
@@ -208,7 +211,7 @@ def conclude(before: ExtendedFit, found: Search, runner: CallRunner = run_in_tur
         share = 1.0 if verdict == "clean" else 0.0
     if verdict == "unexplained":
         findings = tuple(replace(f, kind="correction") for f in findings)
-    without = tuple(x.without for x in choices)
+    without = tuple(x.without for x in choices) if len(choices) > 1 else (before,) * len(choices)
     return Diagnosis(verdict, findings, before, after, share, anomalies, without, nearest)
 
 

@@ -11,7 +11,7 @@ A gain is twice the logarithm of a Bayes factor.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -225,8 +225,11 @@ def least_gain(form: Form) -> float:
     return float(2 * np.log(MIN_ODDS * max(len({x.name for x in form.candidates}), 1)))
 
 
-def choose(form: Form) -> Chosen:
+def choose(form: Form, known: Collection[str] = ()) -> Chosen:
     """Add candidates one after the other, the one with the largest gain first, as long as the gain is clear.
+
+    known: names of effects in the model, candidates of which are further harmonics. They are not added, but nothing
+    that is as well a harmonic of them is, such as a ripple of another wheel that turns equally fast.
 
     One gain alone counts where later ones are below MIN_SHARE of it: to first order, they may be errors of its form.
     """
@@ -235,8 +238,8 @@ def choose(form: Form) -> Chosen:
     left = now.gain
     chosen, gains = list[Candidate](), list[float]()
     while len(chosen) < MOST_AT_ONCE:
-        now = _exchanged(form, chosen, now)
-        first = first_gains(form, chosen, now.logs)
+        now = _exchanged(form, chosen, now, known)
+        first = _without_harmonics(form, first_gains(form, chosen, now.logs), known)
         taken = {x.name for x in chosen}
         finalists = [k for k in _best_of_each_variant(form, first) if form.candidates[k].name not in taken][:FINALISTS]
         tried = [(k, posterior(form, [*chosen, form.candidates[k]], now.logs, COMPARING_PASSES)) for k in finalists]
@@ -261,12 +264,26 @@ def choose(form: Form) -> Chosen:
     )
 
 
-def _exchanged(form: Form, chosen: list[Candidate], now: Posterior) -> Posterior:
+def _without_harmonics(form: Form, gains: np.ndarray, known: Collection[str]) -> np.ndarray:
+    """Return the gains without candidates that a harmonic of a known effect explains about as well."""
+    harmonic: dict[str, float] = {}
+    for x, gain in zip(form.candidates, gains, strict=True):
+        if x.name in known:
+            effect = x.placed.effect.name
+            harmonic[effect] = max(harmonic.get(effect, -np.inf), float(gain) + HARMONIC_GAIN)
+    least = [np.inf if x.name in known else harmonic.get(x.placed.effect.name, -np.inf) for x in form.candidates]
+    return np.where(gains > least, gains, -np.inf)
+
+
+HARMONIC_GAIN = 10.0  # by which another effect must be better than a harmonic of a known one
+
+
+def _exchanged(form: Form, chosen: list[Candidate], now: Posterior, known: Collection[str]) -> Posterior:
     """Exchange chosen candidates, in place, for others that gain more beside the rest."""
     for k in range(len(chosen)):
         others = [*chosen[:k], *chosen[k + 1 :]]
         taken = {x.name for x in others}
-        best = _best_of_each_variant(form, first_gains(form, others, now.logs))
+        best = _best_of_each_variant(form, _without_harmonics(form, first_gains(form, others, now.logs), known))
         best = [j for j in best if form.candidates[j].name not in taken][:1]
         if not best or form.candidates[best[0]] is chosen[k]:
             continue

@@ -20,7 +20,7 @@ from excite.diagnosis.parallel import CallRunner
 from excite.diagnosis.residual_tests import is_shaking
 from excite.diagnosis.score_test import Candidate
 from excite.model import effects
-from excite.model.effects import PlacedEffect
+from excite.model.effects import Effect, PlacedEffect
 from excite.model.machine import EffectEntry, Machine, Quantity
 from excite.smoothing import NotConvergedError
 
@@ -87,7 +87,7 @@ def search(before: ExtendedFit, runner: CallRunner, report: ProgressCallback, de
         wanted = [x for x in candidates_of(stage) if x.name not in dropped]
         form = stage.form(wanted, runner)
         n_candidates = max(n_candidates, len({x.name for x in form.candidates}))
-        found = evidence.choose(form)
+        found = evidence.choose(form, {e.name for e in stage.model.effects})
         if len(stage.model.effects) + len(found.candidates) > MAX_EFFECTS + len(before.model.effects):
             found = _first_of(found, MAX_EFFECTS + len(before.model.effects) - len(stage.model.effects))
         if not found.candidates or deadline.is_over():
@@ -135,10 +135,11 @@ def _first_of(found: Chosen, count: int) -> Chosen:
 
 
 def candidates_of(stage: ExtendedFit) -> list[Candidate]:
-    """List every effect that a model lacks, with trial values."""
+    """List every effect that a model lacks, with trial values; and further harmonics of those that it has."""
     known = {e.name for e in stage.model.effects}
     sensors = [s.name for s in stage.data.space.sensors]
-    found = [x for x in score_test.candidates(stage.machine, sensors, stage.data.duration) if x.name not in known]
+    every = score_test.candidates(stage.machine, sensors, stage.data.duration)
+    found = [x for x in every if x.name not in known or _has_harmonics(x.placed.effect)]
     if not stage.data.sticks:
         return found
     known_near_rest = {e.where for e in stage.model.effects if e.unsticking}
@@ -147,6 +148,11 @@ def candidates_of(stage: ExtendedFit) -> list[Candidate]:
         for x in found
         if x.placed.effect.name != TRANSITION and not (x.placed.unsticking and x.placed.where in known_near_rest)
     ]
+
+
+def _has_harmonics(effect: Effect) -> bool:
+    shapes = effect.shapes.values()
+    return any(s.circular for s in shapes) and any(s.whole and len(s.grid) > 1 for s in shapes)
 
 
 def _refined(stage: ExtendedFit, found: Chosen, runner: CallRunner) -> Chosen:
@@ -372,7 +378,7 @@ def _likely_rivals(form: evidence.Form, stage: ExtendedFit, name: str) -> list[E
     form = form.without(at, value).reduced()
     nothing = np.full(len(form.names), -30.0)
     gains = evidence.first_gains(form, (), nothing)
-    effect_itself = next(k for k, x in enumerate(form.candidates) if x.name == name)
+    effect_itself = max(k for k, x in enumerate(form.candidates) if x.name == name)  # the last, as fitted
     known = {e.name for e in stage.model.effects}
     least = max(gains[effect_itself] - max(RIVAL_LOSS, RIVAL_LOSS_SHARE * gains[effect_itself]), 0.0)
     best: dict[str, int] = {}

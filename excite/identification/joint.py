@@ -17,9 +17,9 @@ from excite.errors import NotIdentifiableError
 from excite.identification import identifiability
 from excite.identification.combinations import describe_combinations
 from excite.identification.estimate import NOTHING_MOVES_MESSAGE, Discrepancy, Estimate, held_note
-from excite.identification.near_rest import friction_near_rest
+from excite.identification.near_rest import friction_near_rest, sticking
 from excite.logs import Log, decimate, derivative
-from excite.model import Model, nothing_known
+from excite.model import Model
 from excite.model.machine import Filter
 from excite.simulation import outside_law
 from excite.smoothing import (
@@ -80,34 +80,21 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
 def joint_exactly(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     """Estimate by joint smoothing if the model alone explains the logs.
 
-    It does if no sensor's innovations are larger than noise and the marginal likelihood says that no force is lacking,
-    with what the machine file calls known or, where the log contradicts that, without it.
-    Raises UnexplainedError if not.
+    It does if no sensor's innovations are larger than noise and the marginal likelihood says that no force is lacking.
+    If not, friction may stick (see `_fit_sticking`). Raises UnexplainedError if neither explains the logs.
     """
-    prepared = _prepare(model, logs, filter)
-    space, measurements, starts, _ = prepared
-    fit, explains = _exact_fit(prepared, logs)
-    if not explains and model.known and fit.linear:
-        free = replace(space, model=replace(model, known=nothing_known(len(model.nominal))))
-        explains = _exact_fit((free, *prepared[1:]), logs)[1]
-    if not explains:
+    space, measurements, starts, held = _prepare(model, logs, filter)
+    readings = sum(float(data.used.sum()) for data in measurements)
+    limit = Settings(cost_limit=LOST_COST_RATIO * readings)
+    fit = fit_logs(space, measurements, starts, model.nominal, starts, held, settings=limit)
+    close = fit.step <= CLOSE_STEP and not find_suspect_sensors(space, logs, fit)
+    if (not close or shows_sticking(model, logs, filter, fit)) and (stuck := _fit_sticking(model, logs, filter, held)):
+        return stuck
+    if not close or lacks_forces(space, measurements, starts, held, fit):
         raise UnexplainedError("the model alone does not explain the log")
     fit, one_sided, flat_notes = quantify_uncertainty(space, measurements, starts, fit)
     notes = (*describe_noise(space, measurements), *flat_notes)
     return _build_estimate(space, measurements, fit, filter, notes, one_sided)
-
-
-Prepared = tuple[StateSpace, Sequence[Measurements], Sequence[Trajectory], np.ndarray]
-
-
-def _exact_fit(prepared: Prepared, logs: Sequence[Log]) -> tuple[Fit, bool]:
-    """Fit the model alone; tell if it explains the logs."""
-    space, measurements, starts, held = prepared
-    readings = sum(float(data.used.sum()) for data in measurements)
-    limit = Settings(cost_limit=LOST_COST_RATIO * readings)
-    fit = fit_logs(space, measurements, starts, space.model.nominal, starts, held, settings=limit)
-    close = fit.step <= CLOSE_STEP and not find_suspect_sensors(space, logs, fit)
-    return fit, close and not lacks_forces(space, measurements, starts, held, fit)
 
 
 def joint_beside_forces(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
@@ -128,7 +115,9 @@ def joint_beside_forces(model: Model, logs: Sequence[Log], filter: Filter) -> Es
     return replace(estimate, doubt=UNEXPLAINED_DOUBT + moving, discrepancy=_discrepancy(missing))
 
 
-def _prepare(model: Model, logs: Sequence[Log], filter: Filter) -> Prepared:
+def _prepare(
+    model: Model, logs: Sequence[Log], filter: Filter
+) -> tuple[StateSpace, Sequence[Measurements], Sequence[Trajectory], np.ndarray]:
     """Return the state space, measurements, first trajectories, and parameters (n_base,) of what is at rest."""
     space = build_state_space(model, common_sensors(model, logs), bool(model.machine.contacts))
     measurements, starts = prepare_logs(space, logs, filter, unbiased=True)
@@ -154,6 +143,27 @@ def shows_sticking(model: Model, logs: Sequence[Log], filter: Filter, fit: Fit) 
     if min(len(near), len(moving)) < MIN_STICKING_SAMPLES:
         return False
     return float(np.mean(near)) > STICKING_RATIO * float(np.mean(moving))
+
+
+def _fit_sticking(model: Model, logs: Sequence[Log], filter: Filter, held: np.ndarray) -> Estimate | None:
+    """Fit with friction of either sign near rest; None if the logs have no rest or are not explained by it."""
+    rests = sticking(model, logs, filter)
+    if rests is None:
+        return None
+    soft, extra = rests
+    space = build_state_space(soft, common_sensors(soft, logs))
+    measurements, starts = prepare_logs(space, logs, filter, unbiased=True, extra_torque_noise=extra)
+    fit = fit_logs(space, measurements, starts, model.nominal, starts, held)
+    if fit.step > CLOSE_STEP or find_suspect_sensors(space, logs, fit):
+        return None
+    fit, one_sided, flat_notes = quantify_uncertainty(space, measurements, starts, fit)
+    share = float(np.mean([np.mean(x > 0) for x in extra]))
+    note = (
+        f"friction sticks in this log: in the {format_number(100 * share, 2)} % of it in which a joint is near rest,"
+        " the friction may have any value up to Fs"
+    )
+    notes = (*describe_noise(space, measurements), *flat_notes, note)
+    return _build_estimate(space, measurements, fit, filter, notes, one_sided)
 
 
 def _build_estimate(

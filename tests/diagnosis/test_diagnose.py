@@ -598,7 +598,7 @@ def test_what_a_clean_log_does_not_show_goes(straight: Model) -> None:
         entry = placing.parse_effect(text, straight.machine, 12.0)
         more = fits.refit(placing.with_effects(straight.machine, entry), clean)
         assert (more.wald(entry.label) > 0) == seen
-        assert selection.added(clean, selection._without_idle(clean, more, {})) == []
+        assert selection.added(clean, selection._without_idle(clean, more, set(), {})) == []
 
 
 def test_an_amount_and_its_shapes_are_sure_together(straight: Model) -> None:
