@@ -90,14 +90,14 @@ def assess(
     told = seen if shown else errors
     gains = tuple(hold_out.hold_out_gain(a, b) for a, b in _pairs(d, told))
     total_gain = hold_out.hold_out_gain(told[0], told[min(1, len(told) - 1)])
-    before = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.before))
-    after = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.after)) if d.findings else before
+    before = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.before.alone))
+    after = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.after.alone)) if d.findings else before
     located = d.located
     if d.verdict == "unexplained":  # replace lines of suspect sensors by located misfits
         other_lines = [line for line in d.located if line not in d.after.suspect_sensors]
         located = (
             *other_lines[:FIRST_ANOMALY_LINES],
-            *residuals.locate_misfit(d.after),
+            *residuals.locate_misfit(d.after.alone),
             *other_lines[FIRST_ANOMALY_LINES:],
         )
     differs = d.verdict == "named" and not d.findings  # several logs, of which each alone is explained

@@ -166,6 +166,18 @@ class ExtendedFit:
         along = tuple(replace(t, lacking=np.zeros(0), force_error=None) for t in fit.trajectories)
         return replace(self, fit=replace(fit, unknown=unknown, trajectories=along)).relinearised
 
+    @cached_property
+    def alone(self) -> ExtendedFit:
+        """The fit without anything beside the model, along the same trajectories. Raises NotConvergedError."""
+        if self.exact:
+            return self
+        nothing = smoothing.Lacking((), (), 0, np.zeros(len(self.data.space.forces)))
+        unknown = smoothing.UnknownForces((nothing,) * len(self.measurements))
+        along = tuple(replace(t, lacking=np.zeros(0), force_error=None) for t in self.fit.trajectories)
+        bare = replace(self, measurements=self.data.measurements)
+        bare = replace(bare, fit=replace(self.fit, unknown=unknown, trajectories=along))
+        return replace(bare, fit=bare.relinearised)
+
     @property
     def relinearised(self) -> Fit:
         """The fit linearised about its parameters and trajectories with all readings. Raises NotConvergedError."""

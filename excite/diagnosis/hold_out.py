@@ -20,7 +20,7 @@ from excite.diagnosis.fits import RESUMED, ExtendedFit
 from excite.logs import filtered_regression
 from excite.model import build
 from excite.model.machine import Machine
-from excite.smoothing import Fit, NotConvergedError, predict_readings
+from excite.smoothing import Fit, Measurements, NotConvergedError, StateSpace, Trajectory, integrate, predict_readings
 
 STRETCH_S = 2.0  # length of a withheld stretch [s]; chosen
 WANTED_STRETCHES = 20  # number of stretches; chosen
@@ -193,8 +193,12 @@ def _errors_of_turn(
         return None
     squares, counts, motion, noise = [], [], [], []
     for r, p, own in zip(stage.measurements, rest.trajectories, stretches, strict=True):
+        if not stage.exact:
+            p = _by_model_alone(space, r, p, rest.X, own)
         u = space.delivered_torques(r.torque, rest.X)[0] + p.sampled_torque_error
         h, _, weight, *_ = predict_readings(space, r, p, u, rest.X)
+        if not np.isfinite(h).all():
+            return None
         noise.append(r.used.sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300))
         for a, b in own:
             valid = r.used[a:b] > 0
@@ -212,6 +216,20 @@ def _errors_of_turn(
         np.full(len(squares), turn),
         _likelihood_of_stretches(stage, rest, stretches) if likelihood else np.full(len(squares), np.nan),
     )
+
+
+def _by_model_alone(
+    space: StateSpace, r: Measurements, p: Trajectory, X: np.ndarray, stretches: Sequence[tuple[int, int]]
+) -> Trajectory:
+    """Return a trajectory that, within the stretches, follows the model from their first states, without any errors."""
+    inputs = space.inputs(space.delivered_torques(r.torque, X)[0], p.ground_inputs)
+    state, error = p.state.copy(), p.torque_error.copy()
+    first = np.array([a for a, _ in stretches], int)
+    for k in range(max((b - a for a, b in stretches), default=1) - 1):
+        here, left, right = (np.repeat(x[first + j], 2, axis=0) for x, j in ((state, k), (inputs, k), (inputs, k + 1)))
+        state[first + k + 1] = integrate(space, here, left[:-1], right[:-1], X).end[::2]
+        error[first + k] = 0.0
+    return replace(p, state=state, torque_error=error)
 
 
 def _likelihood_of_stretches(

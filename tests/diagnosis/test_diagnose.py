@@ -324,7 +324,7 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
     for wrong in ("asymmetric_coulomb@rear_roll=60", "shear_saturation@rear_roll=6"):
         extended = placing.with_effects(found.after.machine, placing.parse_effect(wrong, straight.machine, 40.0))
         dropped: dict[str, str] = {}
-        more = selection._without_idle(found.before, fits.refit(extended, found.after), dropped)
+        more = selection._without_idle(found.before, fits.refit(extended, found.after), set(), dropped)
         without = selection._fits_without(found.before, more, run_in_turn)
         needless = selection._needless(more, without)
         assert [n for n in selection.added(found.before, more) if n != needless] == selection.added(
