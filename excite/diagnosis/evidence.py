@@ -242,7 +242,7 @@ def choose(form: Form, known: Collection[str] = ()) -> Chosen:
         first = _without_harmonics(form, first_gains(form, chosen, now.logs), known)
         taken = {x.name for x in chosen}
         finalists = [k for k in _best_of_each_variant(form, first) if form.candidates[k].name not in taken][:FINALISTS]
-        tried = [(k, posterior(form, [*chosen, form.candidates[k]], now.logs, COMPARING_PASSES)) for k in finalists]
+        tried = [(k, _beside(form, [*chosen, form.candidates[k]], now.logs)) for k in finalists]
         tried = [
             (k, p)
             for k, p in tried
@@ -262,6 +262,30 @@ def choose(form: Form, known: Collection[str] = ()) -> Chosen:
     return Chosen(
         tuple(chosen), tuple(now.factors(form, chosen)) if chosen else (), tuple(gains), left, tuple(np.exp(now.logs))
     )
+
+
+def likeliest(form: Form, known: Collection[str], count: int) -> list[Chosen]:
+    """Return the candidates, each by itself, that gain most, however little."""
+    form = form.reduced()
+    now = posterior(form, ())
+    gains = _without_harmonics(form, first_gains(form, (), now.logs), known)
+    found = []
+    for k in _best_of_each_variant(form, gains)[:count]:
+        one = (form.candidates[k],)
+        best = _beside(form, one, now.logs)
+        found.append(
+            Chosen(one, tuple(best.factors(form, one)), (best.gain - now.gain,), 0.0, tuple(np.exp(best.logs)))
+        )
+    return found
+
+
+def _beside(form: Form, chosen: Sequence[Candidate], logs: np.ndarray) -> Posterior:
+    """Return the most likely sizes beside some candidates, sought from earlier ones and from next to nothing.
+
+    Where a candidate explains all that the unknown forces did, sizes fall to nothing, which takes many passes.
+    """
+    starts = (logs, np.full(len(form.names), LEVELS[0]))
+    return max((posterior(form, chosen, x, COMPARING_PASSES) for x in starts), key=lambda p: p.gain)
 
 
 def _without_harmonics(form: Form, gains: np.ndarray, known: Collection[str]) -> np.ndarray:

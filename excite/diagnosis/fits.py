@@ -314,9 +314,8 @@ def _follow(
         data.held,
         settings=replace(settings, cost_limit=limit),
     )
-    if fit.linear and fit.step <= smoothing.ACCEPTABLE_STEP and fit.cost <= limit:
-        return without_smoother_levels(fit), data.measurements
-    if fit.linear and fit.status != "stopped" and fit.cost <= CLOSE_FIT_COST_RATIO * data.n_readings:
+    near = CLOSE_FIT_COST_RATIO * data.n_readings  # of a dull drive, of which the next step is long
+    if fit.linear and fit.cost <= (limit if fit.step <= smoothing.ACCEPTABLE_STEP else near):
         return without_smoother_levels(fit), data.measurements
     if exactly:
         raise NotConvergedError("exact dynamics do not follow the logs")

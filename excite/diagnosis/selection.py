@@ -93,6 +93,13 @@ def search(before: ExtendedFit, runner: CallRunner, report: ProgressCallback, de
         if not found.candidates or deadline.is_over():
             if deadline.is_over():
                 break
+            if not stage.exact:
+                exact = _followed_exactly(stage, form, runner)
+                stage.release()
+                if exact is None:
+                    break
+                stage = exact
+                continue
             stage.release()
             report(0.2 + 0.1 * turn, "testing each effect given the others")
             without = _fits_without(before, stage, runner)
@@ -102,17 +109,35 @@ def search(before: ExtendedFit, runner: CallRunner, report: ProgressCallback, de
             dropped[needless] = "the other effects replace it"
             stage = refit(_without(stage, [needless]), stage)
             continue
+        others = _alternatives(form, found)
         found = _refined(stage, found, runner)
         report(0.15 + 0.1 * turn, "fitting effects")
         machine = effects.with_effects(stage.machine, *entries(found))
         stage.release()
         try:
-            stage = _without_idle(before, refit(machine, stage), idle, dropped)
+            stage = _with_best_shapes(refit(machine, stage), others, runner)
+            stage = _without_idle(before, stage, idle, dropped)
         except NotConvergedError:
             break
     report(0.85, "comparing rivals")
     stage, choices = _judged(before, stage, without, runner, deadline)
     return Search(stage, choices, found.left, n_candidates, dropped)
+
+
+def _followed_exactly(stage: ExtendedFit, form: evidence.Form, runner: CallRunner) -> ExtendedFit | None:
+    """Return the best exact fit with one of the likeliest effects, where unknown forces hide which one it is.
+
+    None if exact dynamics follow the logs with none of them.
+    """
+    likely = evidence.likeliest(form, {e.name for e in stage.model.effects}, MAX_RIVALS)
+    machines = [effects.with_effects(stage.machine, *entries(x)) for x in likely]
+    names = [x.candidates[0].name for x in likely]
+    found = [
+        x
+        for name, x in zip(names, refit_all(machines, stage, runner), strict=True)
+        if x is not None and not _is_idle(name, x) and is_plausible(name, x) and not x.impossible
+    ]
+    return min(found, key=lambda x: x.deviance, default=None)
 
 
 def give_up(
@@ -128,6 +153,41 @@ def give_up(
     n_candidates = len({x.name for x in form.candidates})
     stage, choices = _judged(before, stage, _fits_without(before, stage, runner), runner, deadline)
     return Search(stage, choices, left, n_candidates, dict(reasons))
+
+
+def _alternatives(form: evidence.Form, found: Chosen) -> list[EffectEntry]:
+    """Return chosen effects with other trial shapes that to first order gain about as much."""
+    form, alternatives = form.reduced(), list[EffectEntry]()
+    logs = np.log(np.array(found.sizes))
+    for k, x in enumerate(found.candidates):
+        rest = [*found.candidates[:k], *found.candidates[k + 1 :]]
+        gains = evidence.first_gains(form, rest, logs)
+        own = [j for j, y in enumerate(form.candidates) if y.name == x.name]
+        best = max(float(gains[j]) for j in own)
+        for j in own:
+            if gains[j] > best - RIVAL_LOSS and form.candidates[j] is not x:
+                both = [*rest, form.candidates[j]]
+                alternatives.append(
+                    _start_entry(form.candidates[j], evidence.posterior(form, both, logs, 0).factors(form, both)[-1])
+                )
+    return alternatives
+
+
+def _with_best_shapes(stage: ExtendedFit, others: Sequence[EffectEntry], runner: CallRunner) -> ExtendedFit:
+    """Return the best fit with each effect in turn at other values of the shapes that a fit does not find."""
+    tried: dict[tuple[str, ...], Machine] = {}
+    for entry in others if stage.exact else ():
+        name = entry.label
+        if name not in {e.name for e in stage.model.effects}:
+            continue
+        placed = stage.placed(name)
+        fixed = [n for n in placed.shapes if f"{name}.{n}" not in stage.model.base.names]
+        values = {n: float(entry.shape[n].value) for n in fixed if n in entry.shape}
+        if any(abs(x - placed.values[n]) > 1e-9 for n, x in values.items()):
+            key = (name, *(f"{n}={x:g}" for n, x in values.items()))
+            tried.setdefault(key, effects.with_effects(_without(stage, [name]), entry))
+    found = [x for x in refit_all(list(tried.values())[:MAX_RIVALS], stage, runner) if x is not None]
+    return min([stage, *found], key=lambda x: x.deviance)
 
 
 def _first_of(found: Chosen, count: int) -> Chosen:
