@@ -36,7 +36,7 @@ COMPARING_PASSES = 8  # of it where candidates are compared
 FINALISTS = 8  # candidates that are compared with the sizes renewed
 MIN_ODDS = 20.0  # posterior odds from which a candidate is added, with even odds that some effect is there
 CREDIBLE_ODDS = 20.0  # odds against the best below which a rival stays: the 95 % credible set
-MIN_SHARE = 0.08  # of the first gain in a turn, down to which first-order gains tell causes from errors of the form
+MIN_SHARE = 0.2  # of the first gain in a turn, down to which first-order gains tell causes from errors of the form
 MOST_AT_ONCE = 5  # effects that are added before the model is fitted again
 
 
