@@ -80,6 +80,12 @@ class FitData:
         return float(sum(r.used.sum() for r in self.measurements))
 
     @property
+    def noise_cost(self) -> float:
+        """Largest cost that noise may cause."""
+        n = self.n_readings
+        return n + max(COST_TOLERANCE * n, CHANCE_STDS * float(np.sqrt(2 * n)))
+
+    @property
     def duration(self) -> float:
         """Duration of the longest log [s]."""
         return max(float(log.t[-1] - log.t[0]) for log in self.logs)
@@ -125,8 +131,7 @@ class ExtendedFit:
     @property
     def excess_cost(self) -> float:
         """Cost beyond what noise may cause."""
-        chance = CHANCE_STDS * float(np.sqrt(2 * self.expected_cost))
-        return max(0.0, self.fit.cost - self.expected_cost - max(COST_TOLERANCE * self.expected_cost, chance))
+        return max(0.0, self.fit.cost - self.data.noise_cost)
 
     @cached_property
     def deviance(self) -> float:
@@ -314,7 +319,8 @@ def _follow(
         data.held,
         settings=replace(settings, cost_limit=limit),
     )
-    near = CLOSE_FIT_COST_RATIO * data.n_readings  # of a dull drive, of which the next step is long
+    # Of a dull drive the next step may be long although the cost is that of noise.
+    near = data.noise_cost if fit.status == "stopped" else CLOSE_FIT_COST_RATIO * data.n_readings
     if fit.linear and fit.cost <= (limit if fit.step <= smoothing.ACCEPTABLE_STEP else near):
         return without_smoother_levels(fit), data.measurements
     if exactly:
