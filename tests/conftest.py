@@ -23,8 +23,9 @@ from support.logs import logged
 
 import excite
 from excite.model import Model, prediction
-from excite.model.machine import machine
+from excite.model.machine import Problem, machine
 from excite.simulation import Motion, simulate
+from excite.workflows import choose_problem
 
 # A package keeps a public name when it is first used: one that a test has replaced in its module would stay.
 for _module in pkgutil.walk_packages(excite.__path__, "excite."):
@@ -32,6 +33,8 @@ for _module in pkgutil.walk_packages(excite.__path__, "excite."):
         _package = importlib.import_module(_module.name)
         for _name in getattr(_package, "__all__", ()):
             getattr(_package, _name)
+
+TWO_JOINTS = Path(__file__).parent / "support" / "two_joints.toml"
 
 settings.register_profile("calm", deadline=None)  # other work on the machine is no fault of the code
 settings.load_profile("calm")
@@ -50,6 +53,17 @@ def straight() -> Model:
 @pytest.fixture(scope="session")
 def emps() -> Model:
     return prediction.build(machine.load_machine("emps"))
+
+
+@pytest.fixture(scope="session")
+def arm() -> Model:
+    return prediction.build(machine.load_machine(str(TWO_JOINTS)))
+
+
+@pytest.fixture(scope="session")
+def problem(arm: Model) -> Problem:
+    """The arm's design problem."""
+    return choose_problem(arm.machine, None, None)[1]
 
 
 @pytest.fixture(scope="session")

@@ -39,7 +39,7 @@ class Need:
 
 @dataclass(frozen=True)
 class NumberField:
-    """What the field of a number takes: its label, least value, whether a whole number, whether it may be empty."""
+    """Rules of a number field: label, least value, whether the number is whole, whether there must be one."""
 
     label: str
     low: float

@@ -11,7 +11,7 @@ A gain is twice the logarithm of a Bayes factor.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -27,10 +27,11 @@ from excite.diagnosis.score_test import (
     renumber_columns,
 )
 from excite.model.effects import Site
-from excite.smoothing import SIZE_SCATTER, Fit, UnknownForces
+from excite.smoothing import SIZE_SCATTER, Fit, UnknownForces, sizes_step
 
 AMOUNT_STD = 2.0  # prior standard deviation of an amount, over its typical size
 LEVELS = np.linspace(-6.0, 2.0, 9)  # logarithms of the sizes' common level that are tried
+NO_SIZE = -30.0  # logarithm of a size that is none
 PASSES = 40  # of the fixed point of the sizes
 COMPARING_PASSES = 8  # of it where candidates are compared
 FINALISTS = 8  # candidates that are compared with the sizes renewed
@@ -75,6 +76,11 @@ class Form:
             self, information=self.information[np.ix_(keep, keep)], right_side=right_side, outer=self.outer - len(at)
         )
 
+    @property
+    def nothing(self) -> np.ndarray:
+        """Logarithms of sizes (groups,) with which there are no unknown forces."""
+        return np.full(len(self.names), NO_SIZE)
+
     def columns(self, chosen: Sequence[Candidate]) -> np.ndarray:
         """Return the places of candidates' columns among those of coefficients and candidates."""
         return len(self.group) + np.array([c for x in chosen for c in x.columns], int)
@@ -116,13 +122,9 @@ def build_form(
     logs = zip(runner(calls), fit.indices, unknown.index, strict=True)
     for gram, own, index in logs:
         at = np.r_[own, K + index, K + count : K + count + C]
-        e = np.r_[1 : 1 + len(own), len(gram) - C - len(index) : len(gram)]  # data first, a draw of noise may follow
-        new = np.arange(len(at)) >= len(own)
-        block = gram[np.ix_(e, e)]
-        block[: len(own), : len(own)] = 0.0  # in the fit's information
-        A[np.ix_(at, at)] += block
-        b[at[new]] -= gram[0, e[new]]
-    none = np.zeros(0, int)
+        gram[1 : 1 + len(own), 1 : 1 + len(own)] = 0.0  # in the fit's information
+        A[np.ix_(at, at)] += gram[1:, 1:]
+        b[at[len(own) :]] -= gram[0, 1 + len(own) :]
     group = np.zeros(count, int)
     for k, one in enumerate(unknown.groups):
         group[one.every] = k
@@ -134,7 +136,7 @@ def build_form(
         for x in found
         for _ in x.columns
     ]
-    return Form(A, b, K, group if count else none, tuple(g.name for g in unknown.groups), tuple(found), np.array(std))
+    return Form(A, b, K, group, tuple(g.name for g in unknown.groups), tuple(found), np.array(std))
 
 
 def _products(log: FittedLog, found: Sequence[Candidate]) -> np.ndarray:
@@ -148,7 +150,7 @@ def posterior(
     G, columns, n = len(form.group), form.columns(chosen), len(form.names)
     at = np.r_[np.arange(G), columns]
     information, right_side = form.information[np.ix_(at, at)], form.right_side[at]
-    fixed, count = form.amount_std[columns - G], np.bincount(form.group, minlength=n)
+    fixed = form.amount_std[columns - G]
 
     def solve(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
         size = np.r_[np.exp(logs)[form.group], fixed]
@@ -163,10 +165,7 @@ def posterior(
         logs = max(levels, key=lambda x: solve(x)[2])
     for _ in range(passes if G else 0):
         mean, variance, _, _ = solve(logs)
-        square = np.bincount(form.group, mean[:G] ** 2, n)
-        determined = count - np.bincount(form.group, variance[:G], n)
-        slope = square - determined - (logs - logs.mean()) / SIZE_SCATTER**2
-        logs = logs + np.clip(slope / (2 * determined + square + 1 / SIZE_SCATTER**2), -0.7, 0.7)
+        logs = logs + sizes_step(mean[:G], variance[:G], form.group, logs, 1 / SIZE_SCATTER**2)
     mean, variance, gain, size = solve(logs)
     scatter = float(np.sum((logs - logs.mean()) ** 2)) / SIZE_SCATTER**2 if G else 0.0
     return Posterior(logs, gain - scatter, mean * size, np.sqrt(np.maximum(variance, 0)) * size)
@@ -258,7 +257,7 @@ def choose(form: Form, known: Collection[str] = ()) -> Chosen:
         gains.append(gain)
         now = posterior(form, chosen, best.logs, COMPARING_PASSES)
     if chosen:
-        left = now.gain - _gain_alone(form, chosen)
+        left = now.gain - posterior(form, chosen, form.nothing, 0).gain
     return Chosen(
         tuple(chosen), tuple(now.factors(form, chosen)) if chosen else (), tuple(gains), left, tuple(np.exp(now.logs))
     )
@@ -321,15 +320,17 @@ def _exchanged(form: Form, chosen: list[Candidate], now: Posterior, known: Colle
 EXCHANGE_GAIN = 1.0  # by which another candidate must be better to take a chosen one's place
 
 
-def _gain_alone(form: Form, chosen: Sequence[Candidate]) -> float:
-    """Return the gain of candidates without unknown forces."""
-    return posterior(form, chosen, np.full(len(form.names), -30.0), 0).gain
-
-
 def _best_of_each_variant(form: Form, gains: np.ndarray) -> list[int]:
     """Return the best candidate of each variant that gains, best first."""
-    best: dict[tuple[str, ...], int] = {}
+    return best_of_each(form, gains, lambda x: x.variant, 0.0)
+
+
+def best_of_each(
+    form: Form, gains: np.ndarray, kind: Callable[[Candidate], Hashable], least: float | None = None
+) -> list[int]:
+    """Return the best candidate of each kind, best first. least: gain that it must exceed."""
+    best: dict[Hashable, int] = {}
     for k in np.argsort(-gains):
-        if gains[k] > 0:
-            best.setdefault(form.candidates[k].variant, int(k))
+        if least is None or gains[k] > least:
+            best.setdefault(kind(form.candidates[k]), int(k))
     return list(best.values())

@@ -74,22 +74,22 @@ def assess(
     The gain of a finding is that over the model with all others. One that predicts withheld data no better is given up.
     """
     report, deadline = progress or (lambda share, what: None), deadline or Deadline()
-    stages = [d.before, d.after, *(x for x in d.without if x is not None)] if d.findings else [d.before]
+    last = d.after if d.findings else d.before
+    stages = list({id(x): x for x in (d.before, last, *d.without) if x is not None}.values())
     likelihood = any(f.kind == "cause" for f in d.findings)  # only these are judged by it
-    seen = [hold_out.hold_out_torques(x) for x in stages]
-    shown = None not in seen
-    errors = seen if shown and not likelihood else _hold_out(stages, likelihood, runner, report)
-    pairs = _pairs(d, errors)
-    reasons = [reason_against(f, d.after, *pair) for f, pair in zip(d.findings, pairs, strict=True)]
-    if any(reasons) and errors is not seen:  # withhold every part before a name is given up
-        more = _pairs(d, _hold_out(stages, likelihood, runner, report, True))
-        reasons = [reason_against(f, d.after, *pair) for f, pair in zip(d.findings, more, strict=True)]
+    torques = [hold_out.hold_out_torques(x) for x in stages]
+    by_torques = None not in torques  # what people see; names are judged by the motion
+    errors = torques if by_torques and not likelihood else _hold_out(stages, likelihood, runner, report)
+    reasons = _reasons_against(d, stages, errors)
+    if any(reasons) and errors is not torques:  # withhold every part before a name is given up
+        reasons = _reasons_against(d, stages, _hold_out(stages, likelihood, runner, report, True))
     given_up = {f.name: reason for f, reason in zip(d.findings, reasons, strict=True) if reason}
     if given_up:
-        return assess(_give_up(d, given_up, runner, deadline), progress, runner, deadline)
-    told = seen if shown else errors
-    gains = tuple(hold_out.hold_out_gain(a, b) for a, b in _pairs(d, told))
-    total_gain = hold_out.hold_out_gain(told[0], told[min(1, len(told) - 1)])
+        found = selection.give_up(d.before, d.after, given_up, runner, deadline)
+        return assess(conclude(d.before, found, runner), progress, runner, deadline)
+    told = dict(zip(map(id, stages), torques if by_torques else errors, strict=True))
+    gains = tuple(hold_out.hold_out_gain(told.get(id(x)), told[id(last)]) for x in d.without)
+    total_gain = hold_out.hold_out_gain(told[id(d.before)], told[id(last)])
     before = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.before.alone))
     after = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.after.alone)) if d.findings else before
     located = d.located
@@ -144,18 +144,11 @@ def _hold_out(
     return done
 
 
-def _pairs(
-    d: Diagnosis, errors: Sequence[HoldOutErrors | None]
-) -> list[tuple[HoldOutErrors | None, HoldOutErrors | None]]:
-    """Return for each finding the errors without and with it; errors: of the fits before, after, and without each."""
-    beside = iter(errors[2:])
-    return [(None if x is None else next(beside), errors[1]) for x in d.without if len(errors) > 1]
-
-
-def _give_up(d: Diagnosis, reasons: Mapping[str, str], runner: CallRunner, deadline: Deadline) -> Diagnosis:
-    """Return the diagnosis without some findings, for these reasons."""
-    found = selection.give_up(d.before, d.after, reasons, runner, deadline)
-    return conclude(d.before, found, runner)
+def _reasons_against(d: Diagnosis, stages: Sequence[ExtendedFit], errors: Sequence[HoldOutErrors | None]) -> list[str]:
+    """Say of each finding why it is not given, "" if it is. errors: of the stages on withheld stretches."""
+    by_stage = dict(zip(map(id, stages), errors, strict=True))
+    pairs = [(by_stage.get(id(x)), by_stage[id(d.after)]) for x in d.without]
+    return [reason_against(f, d.after, *pair) for f, pair in zip(d.findings, pairs, strict=True)]
 
 
 def explain(

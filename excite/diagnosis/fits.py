@@ -150,7 +150,7 @@ class ExtendedFit:
 
     @cached_property
     def lacking(self) -> smoothing.UnknownForces:
-        """What the model may lack that no effect of the catalogue is, along the fitted logs."""
+        """Shapes, along the fitted logs, of what the model may lack and no effect of the catalogue has."""
         pairs = list(zip(self.measurements, self.bare.trajectories, strict=True))
         white = self.bare.unknown.lacking[0].force_std
         return smoothing.catalogue(self.data.space, pairs, self.bare.X, white, False)
@@ -164,25 +164,21 @@ class ExtendedFit:
     @cached_property
     def bare(self) -> Fit:
         """The fit without unknown forces but white ones. Raises NotConvergedError."""
-        fit = self.fit
-        if not fit.unknown.count:
-            return fit
-        white = fit.unknown.lacking[0].force_std
-        unknown = smoothing.UnknownForces((smoothing.Lacking((), (), 0, white),) * len(self.measurements))
-        along = tuple(replace(t, lacking=np.zeros(0), force_error=None) for t in fit.trajectories)
-        return replace(self, fit=replace(fit, unknown=unknown, trajectories=along)).relinearised
+        if not self.fit.unknown.count:
+            return self.fit
+        return self._beside(self.fit.unknown.lacking[0].force_std, self.measurements).fit
 
     @cached_property
     def alone(self) -> ExtendedFit:
         """The fit without anything beside the model, along the same trajectories. Raises NotConvergedError."""
-        if self.exact:
-            return self
-        nothing = smoothing.Lacking((), (), 0, np.zeros(len(self.data.space.forces)))
-        unknown = smoothing.UnknownForces((nothing,) * len(self.measurements))
+        return self if self.exact else self._beside(np.zeros(len(self.data.space.forces)), self.data.measurements)
+
+    def _beside(self, force_std: np.ndarray, measurements: tuple[Measurements, ...]) -> ExtendedFit:
+        """Return the fit, linearised along the same trajectories, beside white forces alone."""
+        unknown = smoothing.UnknownForces((smoothing.Lacking((), (), 0, force_std),) * len(measurements))
         along = tuple(replace(t, lacking=np.zeros(0), force_error=None) for t in self.fit.trajectories)
-        bare = replace(self, measurements=self.data.measurements)
-        bare = replace(bare, fit=replace(self.fit, unknown=unknown, trajectories=along))
-        return replace(bare, fit=bare.relinearised)
+        found = replace(self, fit=replace(self.fit, unknown=unknown, trajectories=along), measurements=measurements)
+        return replace(found, fit=found.relinearised)
 
     @property
     def relinearised(self) -> Fit:
@@ -272,8 +268,7 @@ def fit_machine(
     NotConvergedError.
     """
     data = prepare_data(machine, logs, filter, friction_near_rest)
-    fit = _follow(data, data.starts, data.space.model.nominal, FROM_START)
-    return _stage(machine, data, fit)
+    return ExtendedFit(machine, data, *_follow(data, data.starts, data.space.model.nominal, FROM_START))
 
 
 def fit_machine_that_sticks(plain: ExtendedFit, logs: Sequence[Log], filter: Filter) -> ExtendedFit:
@@ -297,10 +292,6 @@ def fit_machine_that_sticks(plain: ExtendedFit, logs: Sequence[Log], filter: Fil
 
 
 Fitted = tuple[Fit, tuple[Measurements, ...]]
-
-
-def _stage(machine: Machine, data: FitData, fitted: Fitted) -> ExtendedFit:
-    return ExtendedFit(machine, data, *fitted)
 
 
 def _follow(
@@ -352,7 +343,7 @@ def _continued(machine: Machine, previous: ExtendedFit) -> tuple[FitData, list[T
 def refit(machine: Machine, previous: ExtendedFit) -> ExtendedFit:
     """Fit a machine with other effects to the same logs, from a previous fit. Raises NotConvergedError."""
     data, along, X = _continued(machine, previous)
-    return _stage(machine, data, _follow(data, along, X, RESUMED))
+    return ExtendedFit(machine, data, *_follow(data, along, X, RESUMED))
 
 
 def refit_all(
@@ -367,7 +358,7 @@ def refit_all(
         begun = [(_hold_parameter(data, name), s, X) for (data, s, X), name in zip(begun, held, strict=True)]
     calls: list[Callable[[], Any]] = [partial(_follow_or_none, *own) for own in begun]
     for machine, (data, *_), fitted in zip(machines, begun, runner(calls), strict=True):
-        yield None if fitted is None else _stage(machine, data, fitted)
+        yield None if fitted is None else ExtendedFit(machine, data, *fitted)
 
 
 def _follow_or_none(data: FitData, trajectories: Sequence[Trajectory], X: np.ndarray) -> Fitted | None:

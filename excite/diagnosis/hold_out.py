@@ -225,6 +225,7 @@ def _by_model_alone(
     inputs = space.inputs(space.delivered_torques(r.torque, X)[0], p.ground_inputs)
     state, error = p.state.copy(), p.torque_error.copy()
     first = np.array([a for a, _ in stretches], int)
+    # `integrate` takes consecutive states: each stretch counts twice, and what leads from one to the next is left out.
     for k in range(max((b - a for a, b in stretches), default=1) - 1):
         here, left, right = (np.repeat(x[first + j], 2, axis=0) for x, j in ((state, k), (inputs, k), (inputs, k + 1)))
         state[first + k + 1] = integrate(space, here, left[:-1], right[:-1], X).end[::2]

@@ -1,6 +1,6 @@
 """Residuals of a fitted model: missing torques and forces, and innovations, by signal, time and state of the machine.
 
-A smoothed log gives the torque errors, and with process noise the forces, that the model needs to move as the machine
+A smoothed log gives the torque errors, and beside unknown forces these, that the model needs to move as the machine
 did. Plotted against time, speed, angle, torque, slip, distance and frequency they show what is missing. The innovations
 show in which signal and when, and how much of each signal's error is noise.
 """
@@ -35,7 +35,7 @@ SPECTRUM_SEGMENT_S = 10.24  # length of the segments of a spectrum [s]; chosen: 
 class LogResiduals:
     """Residuals of one log along a fit, N samples, all [SI].
 
-    missing: by label, missing torque of each driven joint, and with process noise each missing force: values (N,),
+    missing: by label, missing torque of each driven joint, and each unknown force: values (N,),
         unit, and the standard deviation of a sample from noise (NaN if unknown).
     quantities: by label, what the machine does: unit, and values (N,) for each row of `missing`.
     linear: the log, linearised about the fit.

@@ -1,4 +1,4 @@
-"""Score tests of effects that a model lacks, in the joint smoother (Rao, 1948).
+"""Signatures of effects that a model lacks, in the joint smoother (score tests: Rao, 1948).
 
 Along a fitted log every effect, at every place and for each of its trial shapes, has a signature: the forces, torques
 and readings that it alone would add. Signatures pass through the smoother's linearised equations as columns beside the
@@ -73,20 +73,6 @@ def _active_signed_shapes(effect: Effect, values: Mapping[str, float]) -> list[s
     return [n for n, s in effect.shapes.items() if s.signed and not s.circular and values[n]]
 
 
-@dataclass(frozen=True)
-class Score:
-    """Evidence for a candidate.
-
-    likelihood_ratio: 2 delta log L to first order. values: magnitude and shapes that it would get. unabsorbed_share:
-    share of the signature that parameters do not absorb.
-    """
-
-    candidate: Candidate
-    likelihood_ratio: float
-    values: Mapping[str, float]
-    unabsorbed_share: float
-
-
 def candidates(machine: Machine, sensors: Sequence[str], duration: float) -> list[Candidate]:
     """List every effect at every place with its trial values, for a log of a duration [s] with these sensors."""
     found: list[Candidate] = []
@@ -127,19 +113,19 @@ def _interval_fits(values: Mapping[str, float], duration: float) -> bool:
 
 
 def refine_candidates(
-    scores: Sequence[Score], machine: Machine, duration: float, reach: float = 1.0
+    near: Sequence[Candidate], machine: Machine, duration: float, reach: float = 1.0
 ) -> list[Candidate]:
-    """List candidates near the best so far, with magnitudes and shapes between the trial values.
+    """List candidates near others, with magnitudes and shapes between the trial values.
 
     reach: how far, as a share of the way to the next trial values.
     """
     found: list[Candidate] = []
     columns = 0
-    for score in scores:
-        placed = score.candidate.placed
+    for x in near:
+        placed = x.placed
         site = Site.of(machine, placed.bodies, duration)
         for values in _nearby_values(placed, site, reach):
-            width = len(score.candidate.columns)
+            width = len(x.columns)
             own = replace(placed, values=values)
             found.append(Candidate(own, tuple(range(columns, columns + width))))
             columns += width
@@ -345,7 +331,7 @@ class SignatureColumns:
 
 
 def _unactuated_rows(space: StateSpace) -> list[int]:
-    """Return the rows with process noise that have no actuator."""
+    """Return the rows on which forces of effects act and that have no actuator."""
     return [k for k, row in enumerate(space.forced_rows) if row not in space.model.actuated]
 
 

@@ -32,8 +32,9 @@ MAX_EFFECTS = 8  # number of effects beside presliding; chosen
 MAX_TURNS = 8  # of choosing and fitting again; chosen
 FORMULA_ERROR = 0.03  # relative difference of two formulas of one effect: 1 to 6 % in results/diagnosis
 MAX_FORMULA_RATIO = 250.0  # largest likelihood ratio that the error of a formula makes; chosen
-# Of an effect's gain, that another in its place may lose to first order to be fitted there; chosen.
-RIVAL_LOSS, RIVAL_LOSS_SHARE = 20.0, 0.05
+# What another effect in the place of one may lose of its gain to first order, to be fitted there, the larger of both.
+RIVAL_LOSS = 20.0  # twice a logarithm of odds; chosen
+RIVAL_LOSS_SHARE = 0.05  # of the gain; chosen
 MAX_RIVALS = 3  # that are fitted in the place of an effect; chosen
 REFINEMENT_REACHES = 1.0, 0.35  # shares of the way to the next trial values, refined in turn; chosen
 TIME_TRIAL_SHARE = 12  # duration over the distance of refined trial instants: a grid of quarters, in thirds
@@ -63,7 +64,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Search:
-    """Where a search ended: the model with its effects, their choices, and what unknown forces gain beside them.
+    """End of a search: the model with its effects, their choices, and the gain of unknown forces beside them.
 
     n_candidates: number that were tried. dropped: names that were chosen and given up again, with the reason.
     """
@@ -84,44 +85,48 @@ def search(before: ExtendedFit, runner: CallRunner, report: ProgressCallback, de
     n_candidates, without, idle = 1, dict[str, ExtendedFit | None](), set[str]()
     for turn in range(MAX_TURNS):
         report(0.1 + 0.1 * turn, "scoring effects")
-        wanted = [x for x in candidates_of(stage) if x.name not in dropped]
-        form = stage.form(wanted, runner)
+        form = stage.form([x for x in candidates_of(stage) if x.name not in dropped], runner)
         n_candidates = max(n_candidates, len({x.name for x in form.candidates}))
         found = evidence.choose(form, {e.name for e in stage.model.effects})
-        if len(stage.model.effects) + len(found.candidates) > MAX_EFFECTS + len(before.model.effects):
-            found = _first_of(found, MAX_EFFECTS + len(before.model.effects) - len(stage.model.effects))
-        if not found.candidates or deadline.is_over():
-            if deadline.is_over():
-                break
-            if not stage.exact:
-                exact = _followed_exactly(stage, form, runner)
-                stage.release()
-                if exact is None:
-                    break
-                stage = exact
-                continue
-            stage.release()
-            report(0.2 + 0.1 * turn, "testing each effect given the others")
-            without = _fits_without(before, stage, runner)
-            needless = _needless(stage, without)
-            if needless is None:
-                break
-            dropped[needless] = "the other effects replace it"
-            stage = refit(_without(stage, [needless]), stage)
-            continue
-        others = _alternatives(form, found)
-        found = _refined(stage, found, runner)
-        report(0.15 + 0.1 * turn, "fitting effects")
-        machine = effects.with_effects(stage.machine, *entries(found))
-        stage.release()
-        try:
-            stage = _with_best_shapes(refit(machine, stage), others, runner)
-            stage = _without_idle(before, stage, idle, dropped)
-        except NotConvergedError:
+        chosen = _first_of(found, MAX_EFFECTS - len(added(before, stage)))
+        if deadline.is_over():
             break
+        if chosen.candidates:
+            report(0.15 + 0.1 * turn, "fitting effects")
+            better = _extended(before, stage, form, chosen, idle, dropped, runner)
+        elif not stage.exact:
+            better = _followed_exactly(stage, form, runner)
+        else:
+            report(0.2 + 0.1 * turn, "testing each effect given the others")
+            stage.release()
+            without = _fits_without(before, stage, runner)
+            better = _without_needless(stage, without, dropped)
+        stage.release()
+        if better is None:
+            break
+        stage, without = better, {}
     report(0.85, "comparing rivals")
     stage, choices = _judged(before, stage, without, runner, deadline)
     return Search(stage, choices, found.left, n_candidates, dropped)
+
+
+def _extended(
+    before: ExtendedFit,
+    stage: ExtendedFit,
+    form: evidence.Form,
+    chosen: Chosen,
+    idle: set[str],
+    dropped: dict[str, str],
+    runner: CallRunner,
+) -> ExtendedFit | None:
+    """Return the fit with chosen effects, as far as it needs them; None if there is none."""
+    others = _alternatives(form, chosen)
+    machine = effects.with_effects(stage.machine, *entries(_refined(stage, chosen, runner)))
+    stage.release()
+    try:
+        return _without_idle(before, _with_best_shapes(refit(machine, stage), others, runner), idle, dropped)
+    except NotConvergedError:
+        return None
 
 
 def _followed_exactly(stage: ExtendedFit, form: evidence.Form, runner: CallRunner) -> ExtendedFit | None:
@@ -224,9 +229,8 @@ def _refined(stage: ExtendedFit, found: Chosen, runner: CallRunner) -> Chosen:
     for reach in (*reaches, *timed):
         lists = []
         for x in found.candidates:
-            score = score_test.Score(x, 0.0, {}, 1.0)
             wanted = reach in reaches or x.placed.effect.timed
-            nearby = score_test.refine_candidates([score], stage.machine, duration, reach) if wanted else []
+            nearby = score_test.refine_candidates([x], stage.machine, duration, reach) if wanted else []
             lists.append([x, *nearby])
         if all(len(own) <= 2 for own in lists):
             continue
@@ -368,20 +372,22 @@ def _needless(stage: ExtendedFit, without: Mapping[str, ExtendedFit | None]) -> 
     return None
 
 
+def _without_needless(
+    stage: ExtendedFit, without: Mapping[str, ExtendedFit | None], dropped: dict[str, str]
+) -> ExtendedFit | None:
+    """Return the fit without an effect that gains too little beside the others; None if each has its place."""
+    needless = _needless(stage, without)
+    if needless is None:
+        return None
+    dropped[needless] = "the other effects replace it"
+    return refit(_without(stage, [needless]), stage)
+
+
 def slim(stage: ExtendedFit) -> ExtendedFit:
     """Return a fit without its linearised logs, which take most of the memory; its deviance is kept."""
     slimmed = replace(stage, fit=replace(stage.fit, linear=()))
     slimmed.__dict__["deviance"] = stage.deviance
     return slimmed
-
-
-@dataclass(frozen=True)
-class _Rival:
-    """An effect in the place of another: its fit, entry of the machine file, and information (lower is better)."""
-
-    stage: ExtendedFit
-    entry: EffectEntry
-    information: float
 
 
 def _judged(
@@ -399,21 +405,21 @@ def _judged(
     stage.release()
     tried = [(name, entry) for name in names for entry in _likely_rivals(form, stage, name)]
     machines = [effects.with_effects(_without(stage, [name]), entry) for name, entry in tried]
-    rivals: dict[str, list[_Rival]] = {name: [] for name in names}
+    rivals: dict[str, list[tuple[float, EffectEntry]]] = {name: [] for name in names}  # with their information
     for (name, entry), x in zip(tried, refit_all(machines, stage, runner), strict=True):
-        other = f"{entry.name}@{entry.where}"
-        if x is None or _fell_to_zero(other, x) or not is_plausible(other, x) or x.impossible:
+        if x is None or _fell_to_zero(entry.label, x) or not is_plausible(entry.label, x) or x.impossible:
             continue
-        rivals[name].append(_Rival(slim(x), fitted_entry(x, other), information(x, other)))
-        if information(x, other) < information(stage, name) - CLEARLY_BETTER:
+        told = information(x, entry.label)
+        rivals[name].append((told, fitted_entry(x, entry.label)))
+        if told < information(stage, name) - CLEARLY_BETTER:
             return _judged(before, x, _fits_without(before, x, runner), runner, deadline)
     choices = []
     for name in names:
         fit = without.get(name)
         ratio = stage.wald(name) if fit is None else fit.deviance - stage.deviance
         margin = 2 * np.log(evidence.CREDIBLE_ODDS) * stage.dispersion + formula_ratio(ratio)
-        tied = [x.entry for x in rivals[name] if x.information - information(stage, name) < margin]
-        choices.append(Choice(name, ratio, fit, tuple(tied)))
+        tied = tuple(entry for told, entry in rivals[name] if told - information(stage, name) < margin)
+        choices.append(Choice(name, ratio, fit, tied))
     return stage, tuple(choices)
 
 
@@ -436,20 +442,13 @@ def _likely_rivals(form: evidence.Form, stage: ExtendedFit, name: str) -> list[E
     own = stage.model.base.names.index(name)
     value = np.array([-stage.fit.X[k] / stage.model.scale[k] if k == own else 0.0 for k in at])
     form = form.without(at, value).reduced()
-    nothing = np.full(len(form.names), -30.0)
-    gains = evidence.first_gains(form, (), nothing)
+    gains = evidence.first_gains(form, (), form.nothing)
     effect_itself = max(k for k, x in enumerate(form.candidates) if x.name == name)  # the last, as fitted
     known = {e.name for e in stage.model.effects}
     least = max(gains[effect_itself] - max(RIVAL_LOSS, RIVAL_LOSS_SHARE * gains[effect_itself]), 0.0)
-    best: dict[str, int] = {}
-    for k in np.argsort(-gains):
-        if gains[k] > least and form.candidates[k].name not in known:
-            best.setdefault(form.candidates[k].name, int(k))
-    found = []
-    for k in list(best.values())[:MAX_RIVALS]:
-        x = form.candidates[k]
-        found.append(_start_entry(x, evidence.posterior(form, [x], nothing, 0).factors(form, [x])[0]))
-    return found
+    best = evidence.best_of_each(form, gains, lambda x: x.name, least)
+    rivals = [x for x in (form.candidates[k] for k in best) if x.name not in known][:MAX_RIVALS]
+    return [_start_entry(x, evidence.posterior(form, [x], form.nothing, 0).factors(form, [x])[0]) for x in rivals]
 
 
 def _with_presliding(stage: ExtendedFit, runner: CallRunner) -> ExtendedFit:
@@ -459,19 +458,12 @@ def _with_presliding(stage: ExtendedFit, runner: CallRunner) -> ExtendedFit:
         if not wanted:
             return stage
         form = stage.form(wanted, runner).reduced()
-        gains = evidence.first_gains(form, (), np.full(len(form.names), -30.0))
-        best: dict[str, int] = {}
-        for k in np.argsort(-gains):
-            best.setdefault(form.candidates[k].name, int(k))
-        machines = [
-            effects.with_effects(
-                stage.machine, _start_entry(form.candidates[k], np.ones(len(form.candidates[k].columns)))
-            )
-            for k in best.values()
-        ]
+        gains = evidence.first_gains(form, (), form.nothing)
+        best = [form.candidates[k] for k in evidence.best_of_each(form, gains, lambda x: x.name)]
+        machines = [effects.with_effects(stage.machine, _start_entry(x, np.ones(len(x.columns)))) for x in best]
         tried = [
             (stage.deviance - x.deviance - required_likelihood_ratio(name, x, len(best)), x)
-            for name, x in zip(best, refit_all(machines, stage, runner), strict=True)
+            for name, x in zip([y.name for y in best], refit_all(machines, stage, runner), strict=True)
             if x is not None and not _fell_to_zero(name, x) and is_plausible(name, x)
         ]
         excess, found = max(tried, key=lambda x: x[0], default=(0.0, stage))

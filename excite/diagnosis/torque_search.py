@@ -59,11 +59,6 @@ class Tested:
     coefficient: float
     log_odds: float
 
-    @property
-    def score(self) -> score_test.Score:
-        values = dict(self.candidate.placed.values)
-        return score_test.Score(self.candidate, self.chi2, values, 1.0)
-
 
 def score_columns(fit: TorqueFit, columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return chi-squared (C,) and coefficients (C,) of columns (n_rows, n, C) added to a fit one at a time.
@@ -214,7 +209,7 @@ class Search:
                 best.setdefault(x.candidate.name, x)
         chosen = [self.turn_phase(fit, x) for x in best.values() if x.log_odds > 0][: SETTINGS.finalists]
         for reach in REACHES:
-            near = score_test.refine_candidates([x.score for x in chosen], self.machine, self.duration, reach)
+            near = score_test.refine_candidates([x.candidate for x in chosen], self.machine, self.duration, reach)
             near = [x for x in near if len(x.columns) == 1]
             if near:
                 for x in self.test(fit, near, self._columns([x.placed for x in near])):

@@ -46,7 +46,13 @@ from .monte_carlo import (
 )
 from .near_rest import moving_rows as moving_rows, sticking as sticking, with_soft_friction as with_soft_friction
 from .noise_propagation import row_errors as row_errors, row_levels as row_levels
-from .payload import Payload as Payload, payload_parameters as payload_parameters
+from .payload import (
+    Payload as Payload,
+    payload_change as payload_change,
+    payload_parameters as payload_parameters,
+    rigid_parameters as rigid_parameters,
+    told_apart as told_apart,
+)
 from .prediction import Prediction as Prediction, predict_motion as predict_motion, predict_torques as predict_torques
 from .prior import prior_from_estimate as prior_from_estimate, prior_from_logs as prior_from_logs
 from .saved_estimate import (

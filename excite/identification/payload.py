@@ -15,7 +15,6 @@ import scipy
 from excite.errors import UsageError
 from excite.identification.estimate import Estimate
 from excite.model import Model, standard_parameters
-from excite.model.machine import Body
 from excite.model.mechanics import INERTIAL, independent_columns
 
 CLEAR_STDS = 2.0  # standard deviations of the mass, below which the centre is anywhere; chosen
@@ -60,15 +59,12 @@ def payload_parameters(model: Model, loaded: Estimate, unloaded: Estimate) -> Pa
     body = model.machine.body[-1]
     if body.inertia is None or body.inertia.axisymmetric:
         raise UsageError(f"--unloaded: the last body, {body.name}, carries the payload and needs a full inertia")
-    standard = model.base.standard
-    rigid = [any(name in _rigid_names(b) for b in model.machine.body) for name in standard]
     told = np.isfinite(loaded.std) & np.isfinite(unloaded.std)
-    rows = [k for k, j in enumerate(model.base.independent) if rigid[j] and told[k]]
-    G = model.base.matrix[np.ix_(rows, [standard.index(f"{n}{body.index}") for n in INERTIAL])]
-    size = np.linalg.norm(G, axis=0)
-    if not size.any():
+    rows = [k for k in rigid_parameters(model) if told[k]]
+    G = payload_change(model)[rows]
+    if not G.any():
         raise UsageError("--unloaded: no parameter that a payload changes is identified from both sets of logs")
-    kept, left = independent_columns(G / np.where(size > 0, size, 1.0), RANK_TOLERANCE)
+    kept, left = told_apart(G)
     groups = [{INERTIAL[k]: 1.0} for k in kept]
     for j in left:
         for k, share in enumerate(np.linalg.lstsq(G[:, kept], G[:, j], rcond=None)[0]):
@@ -98,9 +94,22 @@ def payload_parameters(model: Model, loaded: Estimate, unloaded: Estimate) -> Pa
     )
 
 
-def _rigid_names(body: Body) -> set[str]:
-    """Names of a body's standard parameters that friction and sensors leave alone."""
-    return {f"{n}{body.index}" for n in (*INERTIAL, "Ia")}
+def payload_change(model: Model) -> np.ndarray:
+    """Return the change (n_base, 10) of the base parameters by each parameter of a payload on the last body."""
+    last = model.machine.body[-1].index
+    return np.asarray(model.base.matrix[:, [model.base.standard.index(f"{n}{last}") for n in INERTIAL]])
+
+
+def rigid_parameters(model: Model) -> tuple[int, ...]:
+    """Return the base parameters that friction and sensors leave alone, in which no more than a payload differs."""
+    names = {f"{n}{b.index}" for b in model.machine.body for n in (*INERTIAL, "Ia")}
+    return tuple(k for k, j in enumerate(model.base.independent) if model.base.standard[j] in names)
+
+
+def told_apart(change: np.ndarray) -> tuple[list[int], list[int]]:
+    """Return the inertial parameters of a payload that a change (rows, 10) tells apart, and the others."""
+    size = np.linalg.norm(change, axis=0)
+    return independent_columns(change / np.where(size > 0, size, 1.0), RANK_TOLERANCE)
 
 
 def _centre(

@@ -74,7 +74,7 @@ def spikes(record: Record) -> Iterator[Finding]:
 
 
 def too_many(k: np.ndarray, c: Channel) -> bool:
-    """Whether a channel has more spikes than repair can answer for."""
+    """Tell if a channel has more spikes than repair can answer for."""
     return len(k) > max(3, MANY * len(c.x))
 
 
@@ -145,7 +145,7 @@ def dropouts(record: Record) -> Iterator[Finding]:
 
 
 def _counts_on(sensor: Sensor) -> bool:
-    """Whether a sensor gives positions, which stand still with their joint and catch up after a drop-out."""
+    """Tell if a sensor gives positions, which stand still with their joint and catch up after a drop-out."""
     return sensor.kind in ("angle", "wheel") and not sensor.is_rate
 
 
@@ -167,7 +167,7 @@ def _comes_to_rest(c: Channel, first: int, last: int) -> bool:
 
 
 def _moved(record: Record, c: Channel, first: int, last: int) -> bool:
-    """Whether any position but the channel's own goes on between two of its readings; taken for granted where none is
+    """Tell if any position but the channel's own goes on between two of its readings; taken for granted where none is
     recorded."""
     known = False
     for d in record.channels.values():

@@ -38,7 +38,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Finding:
-    """What a check found in a sensor's channel. spans: first and last time [s] of each bad stretch."""
+    """Finding of a check in a sensor's channel. spans: first and last time [s] of each bad stretch."""
 
     check: str
     kind: Literal["fault", "doubt", "remark"]

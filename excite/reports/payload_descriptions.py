@@ -1,4 +1,4 @@
-"""What drives with and without a payload show of it, in words."""
+"""Describe what drives with and without a payload show of it."""
 
 from __future__ import annotations
 

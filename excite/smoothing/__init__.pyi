@@ -54,6 +54,7 @@ from .sizes import (
     FitBeside as FitBeside,
     fit_unknown_forces as fit_unknown_forces,
     lacks_forces as lacks_forces,
+    sizes_step as sizes_step,
 )
 from .solver import Settings as Settings
 from .transitions import (

@@ -183,16 +183,13 @@ class _Coefficients:
 def find_sizes(fit: Fit) -> UnknownForces:
     """Return what a fit lacks with its most likely sizes and common level, from the best of several starts."""
     unknown, own = fit.unknown, _integrate_out_parameters(fit)
-    count = np.bincount(own.group)
-    best, most = np.zeros(len(count)), -np.inf
+    groups = len(unknown.groups)
+    best, most = np.zeros(groups), -np.inf
     for start in STARTS:
-        logs = np.full(len(count), start)
+        logs = np.full(groups, start)
         for _ in range(PASSES):
             mean, variance, _ = own.posterior(logs)
-            square = np.bincount(own.group, mean**2)
-            determined = count - np.bincount(own.group, variance)
-            slope = square - determined - 2 * (logs - logs.mean()) / SIZE_SCATTER**2
-            step = np.clip(slope / (2 * determined + square + 2 / SIZE_SCATTER**2), -0.7, 0.7)
+            step = sizes_step(mean, variance, own.group, logs, 2 / SIZE_SCATTER**2)
             before, logs = logs, np.clip(logs + step, LEVELS[0], LEVELS[-1])
             if np.abs(logs - before).max() < SETTLED:
                 break
@@ -200,6 +197,20 @@ def find_sizes(fit: Fit) -> UnknownForces:
         if likelihood > most:
             best, most = logs, likelihood
     return replace(unknown, size=np.exp(best))
+
+
+def sizes_step(
+    mean: np.ndarray, variance: np.ndarray, group: np.ndarray, logs: np.ndarray, tightness: float
+) -> np.ndarray:
+    """Return MacKay's step of the logarithms of sizes (groups,) to more likely ones.
+
+    mean, variance (n,): of the coefficients, over their sizes. group (n,): of each. tightness: pull of the logarithms
+    towards their mean.
+    """
+    square = np.bincount(group, mean**2, len(logs))
+    determined = np.bincount(group, 1 - variance, len(logs))
+    slope = square - determined - tightness * (logs - logs.mean())
+    return np.asarray(np.clip(slope / (2 * determined + square + tightness), -0.7, 0.7))
 
 
 def _integrate_out_parameters(fit: Fit) -> _Coefficients:

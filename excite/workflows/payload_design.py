@@ -14,15 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from excite import trajectories
+from excite import identification, trajectories
 from excite.errors import MachineError
 from excite.model import Model
-from excite.model.mechanics import INERTIAL, independent_columns
+from excite.model.mechanics import INERTIAL
 from excite.simulation import Motion, motion_along
 
 PAYLOAD_SIZE_M = 0.1  # edge of the cube that a payload is taken for: its parameters' sizes, errors are relative to them
 USUAL_SAMPLES = 400  # random samples of a usual motion
-RANK_TOLERANCE = 1e-9  # relative size below which a payload's parameter is a combination of others
 
 
 @dataclass(frozen=True)
@@ -79,11 +78,9 @@ def payload_design(model: Model, mass: float) -> PayloadDesign:
     p = np.array([mass, *(mass * c), J[0, 0], J[0, 1], J[0, 2], J[1, 1], J[1, 2], J[2, 2]])
     long = max(float(np.linalg.norm(c)), PAYLOAD_SIZE_M)
     size = mass * np.array([1.0, *[long] * 3, *[long**2] * 6])
-    G = model.base.matrix[:, [model.base.standard.index(f"{n}{body.index}") for n in INERTIAL]]
-    length = np.linalg.norm(G, axis=0)
-    kept, _ = independent_columns(G / np.where(length > 0, length, 1.0), RANK_TOLERANCE)
-    names = {f"{n}{b.index}" for b in machine.body for n in (*INERTIAL, "Ia")}
-    rigid = tuple(k for k, j in enumerate(model.base.independent) if model.base.standard[j] in names)
+    G = identification.payload_change(model)
+    kept, _ = identification.told_apart(G)
+    rigid = identification.rigid_parameters(model)
     return PayloadDesign(tuple(INERTIAL[k] for k in kept), size[kept], G[:, kept], G @ p, rigid)
 
 

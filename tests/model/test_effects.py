@@ -801,7 +801,7 @@ def test_points_between_the_grids_are_tried_for_every_way_of_counting(straight: 
     passes = [x for x in found if x.name == "compaction_per_pass@drive" and x.placed.values["pass"] == 15.0]
     assert len({x.variant for x in passes}) == 3
     for one in passes:
-        near = score_test.refine_candidates([score_test.Score(one, 100.0, {}, 1.0)], straight.machine, 40.0)
+        near = score_test.refine_candidates([one], straight.machine, 40.0)
         assert {x.variant for x in near} == {one.variant}
         tried = sorted({x.placed.values["pass"] for x in near})
         assert len(tried) == 5
@@ -984,7 +984,7 @@ def test_every_candidate_can_be_tried_closer(duration: float) -> None:
     every = score_test.candidates(VA12, [s.name for s in VA12.sensors("full")], duration)
     assert len(every) > 100
     for x in every:
-        nearby = score_test.refine_candidates([score_test.Score(x, 1.0, x.placed.values, 1.0)], VA12, duration)
+        nearby = score_test.refine_candidates([x], VA12, duration)
         assert all(y.name == x.name for y in nearby)
 
 
@@ -993,12 +993,12 @@ def test_what_acts_between_two_instants_begins_before_it_ends() -> None:
     for duration in (60.0, 600.0):
         found = [x for x in score_test.candidates(VA12, [], duration) if "begin" in x.placed.values]
         assert {x.placed.effect.name for x in found} == {"brake_drag", "vibration_on"}
-        scores = [score_test.Score(x, 1.0, x.placed.values, 1.0) for x in found]
+        tried = found
         reaches = [*selection.REFINEMENT_REACHES]
         while reaches[-1] * duration / selection.TIME_TRIAL_SHARE > selection.INSTANT_ACCURACY_S:
             reaches.append(reaches[-1] * selection.REFINEMENT_REACHES[-1])
         for reach in reaches:
-            found = score_test.refine_candidates(scores, VA12, duration, reach)
+            found = score_test.refine_candidates(tried, VA12, duration, reach)
             for values in (x.placed.values for x in found):
                 end = values.get("end", values["begin"] + values.get("length", 0.0))
                 assert 0 <= values["begin"] < end <= duration

@@ -38,16 +38,6 @@ def with_tables(model: Model, bodies: dict[int, dict[str, Any]], **tables: Any) 
     return model.for_machine(model.machine.model_copy(update={"body": tuple(changed), **tables}))
 
 
-@pytest.fixture(scope="module")
-def arm() -> Model:
-    return build(load_machine(str(ARM)))
-
-
-@pytest.fixture(scope="module")
-def problem(arm: Model) -> Problem:
-    return choose_problem(arm.machine, None, None)[1]
-
-
 def coal_distance(one: np.ndarray, r1: float, other: np.ndarray, r2: float) -> float:
     """Distance of two capsules, ends (2, 3) each."""
     coal = pytest.importorskip("coal")

@@ -18,16 +18,6 @@ from excite.workflows import DesignRequest, choose_problem, design_from, prepare
 ARM = Path(__file__).parents[1] / "support" / "two_joints.toml"
 
 
-@pytest.fixture(scope="module")
-def arm() -> Model:
-    return build(load_machine(str(ARM)))
-
-
-@pytest.fixture(scope="module")
-def problem(arm: Model) -> Problem:
-    return choose_problem(arm.machine, None, None)[1]
-
-
 def basis_of(arm: Model, problem: Problem, kind: str) -> joint_motion.Basis:
     return joint_motion.BASES[kind](problem, *joint_search.end_poses(arm, problem))
 

@@ -13,25 +13,15 @@ import pytest
 from excite import identification, simulation, trajectories, workflows
 from excite.errors import MachineError, UsageError
 from excite.model import Model, build
-from excite.model.machine import Problem, load_machine
+from excite.model.machine import Problem
 from excite.simulation import Motion, motion_along
 from excite.trajectories import joint_motion, joint_search
-from excite.workflows import CampaignRequest, DesignRequest, choose_problem, design_from
+from excite.workflows import CampaignRequest, DesignRequest, design_from
 from excite.workflows.campaign_workflow import campaign_from, check_campaign
 from excite.workflows.payload_design import loaded_machines, payload_contrasts, payload_design, payload_summary
 
 ARM = Path(__file__).parents[1] / "support" / "two_joints.toml"
 QUICK = DesignRequest(starts=1, trajectory="fourier")
-
-
-@pytest.fixture(scope="module")
-def arm() -> Model:
-    return build(load_machine(str(ARM)))
-
-
-@pytest.fixture(scope="module")
-def problem(arm: Model) -> Problem:
-    return choose_problem(arm.machine, None, None)[1]
 
 
 @pytest.fixture(scope="module")
