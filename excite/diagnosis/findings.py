@@ -195,7 +195,7 @@ def _find_differences(model: Model, logs: Sequence[Log], filter: Filter) -> Agre
     """Return what differs between several logs of which each alone is explained down to noise; None if nothing."""
     if model.effects or (not model.slips and len(model.actuated) > MAX_FOLLOWED_JOINTS):
         return None
-    agreement, estimates = identification.compare_sources(model, logs, "joint", filter)
+    agreement, estimates = identification.compare_sources(model, logs, "joint", filter, explained=True)
     if agreement is None or agreement.agree or any(e.status != "valid" for e in estimates):
         return None
     return agreement

@@ -57,11 +57,11 @@ class Agreement:
 
 
 def compare_sources(
-    model: Model, logs: Sequence[Log], method: str, filter: Filter
+    model: Model, logs: Sequence[Log], method: str, filter: Filter, explained: bool = False
 ) -> tuple[Agreement | None, list[Estimate]]:
     """Identify each file of logs by itself and compare the estimates.
 
-    Return no comparison and no estimates for one file, or if one of them gives no estimate.
+    Return no comparison and no estimates for one file, or if one of them gives no estimate. explained: see `identify`.
     """
     groups: dict[str, list[Log]] = {}
     for one in logs:
@@ -69,7 +69,7 @@ def compare_sources(
     if len(groups) < 2:
         return None, []
     try:
-        estimates = [identify(model, group, method, filter) for group in groups.values()]
+        estimates = [identify(model, group, method, filter, explained) for group in groups.values()]
     except NoEstimateError:
         return None, []
     return compare_logs(tuple(groups), estimates), estimates

@@ -17,7 +17,7 @@ from excite.identification.encoder_errors import correct_angles, is_encoder_erro
 from excite.identification.estimate import Estimate, add_notes, held_note
 from excite.identification.identifiability import add_advice
 from excite.identification.inverse_estimate import inverse
-from excite.identification.joint import joint, joint_beside_forces, joint_exactly
+from excite.identification.joint import UnexplainedError, joint, joint_beside_forces, joint_exactly
 from excite.identification.linear_methods import filtered_blocks, ols
 from excite.identification.status import assess
 from excite.logs import NEEDED, Log, doubts_in_errors, examine, planar_speed_sensors, samples, unmeasured
@@ -52,14 +52,21 @@ class Method:
     biased: bool = False
 
 
-def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Filter | None = None) -> Estimate:
+def identify(
+    model: Model,
+    logs: Sequence[Log],
+    method: str = "ols",
+    filter: Filter | None = None,
+    explained: bool = False,
+) -> Estimate:
     """Estimate the base parameters from one log or several.
 
     Single spikes are repaired with a note (see `examine`), doubts about a log are noted, and an unidentifiable
-    parameter comes with the manoeuvre that would identify it.
+    parameter comes with the manoeuvre that would identify it. explained: give no estimate where the method knows that
+    the model alone does not explain the logs.
 
     Raises ValueError for an unknown method, MachineError for sensors or effects the method does not support,
-    NotIdentifiableError, and LogError for a log that cannot be repaired.
+    NotIdentifiableError, LogError for a log that cannot be repaired, and UnexplainedError.
     """
     if method not in METHODS:
         raise ValueError(f"method: {method} is unknown, allowed: {', '.join(METHODS)}")
@@ -88,7 +95,8 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
             )
         try:
             chosen = METHODS[method]
-            estimate = estimate_in_full(chosen.otherwise or chosen.find, chosen.exact, model, repaired, filter)
+            otherwise = _refuse if explained and chosen.exact else chosen.otherwise or chosen.find
+            estimate = estimate_in_full(otherwise, chosen.exact, model, repaired, filter)
             estimate = add_advice(model, repaired, estimate, filter)
         except np.linalg.LinAlgError:
             raise NotIdentifiableError(
@@ -250,6 +258,11 @@ def unused_sensors(model: Model, method: str, logs: Sequence[Log]) -> tuple[str,
     there = [s for s in model.machine.sensors("full") if any(s.name in log.values for log in logs)]
     planar = planar_speed_sensors(model, [s.name for s in there]).sensors if model.machine.planar else ()
     return tuple(s.name for s in there if s.kind not in (*LINEAR_KINDS, *chosen.reads) and s not in planar)
+
+
+def _refuse(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
+    """Raise UnexplainedError, in the place of an estimate beside forces that the model lacks."""
+    raise UnexplainedError("the model alone does not explain the log")
 
 
 def restrict_to_possible(plain: Estimator) -> Estimator:
