@@ -37,7 +37,7 @@ from excite.trajectories import DESIGNED, ComparisonRow, SensorValue
 
 ATTAINABLE = "attainable standard deviation\n[% of the nominal value]"  # label of an axis
 PANEL_IN, PANEL_NARROW_IN, PATH_IN, MIN_DESIGN_IN = 2.3, 1.6, 2.6, 7.5  # heights of panels, and of the figure; chosen
-LEAST_SHARE, LEAST_SHARE_WITH_PATH = 0.8, 0.88  # of the height of a narrow figure, that its texts need; chosen
+LEAST_SHARE, LEAST_SHARE_WITH_PATH = 0.8, 0.87  # of the height of a narrow figure, that its texts need; chosen
 AXIS_IN, BARS_EDGE_IN = 0.9, 0.9  # room for the labels of an axis, and above and below bars; chosen
 LINE_INCHES = 0.165  # of a limit's name; chosen
 LIMIT_LETTERS = 32  # of a limit's name in a line; chosen

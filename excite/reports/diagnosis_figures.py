@@ -46,8 +46,7 @@ INSET = 0.62, 0.42, 0.1, 0.14  # room for labels: left, below, right, above
 HEAD = 0.28  # above the panels of one torque or force
 EDGE = 0.35  # for the title, and for the legend
 SIGNAL_LETTERS, SIGNAL_LETTERS_NARROW = 40, 26  # of a signal's name in a line; chosen
-LEAST_SHARE = 0.87  # of the height of a course and its map, that their texts need; chosen
-MAP_IN = 2.0  # height of a map below a course over time; chosen
+MAP_IN = 1.6  # height of a map below a course over time; chosen
 MISSING_LETTERS = 36  # of the label of a missing torque in a line; chosen
 MAP_INTERVALS = 3  # between ticks of speed, at most; chosen
 PLAIN_POWERS = -3, 5  # powers of ten that axes write without an exponent; chosen
@@ -244,10 +243,10 @@ def when_figure(
     m, narrow = len(before.sensors), is_narrow(12)
     letters = SIGNAL_LETTERS_NARROW if narrow else SIGNAL_LETTERS
     signals = [wrap_label((words or {}).get(n, n), letters) for n in before.sensors]
-    block = max(m * (0.1 + 0.16 * max(1 + one.count("\n") for one in signals)), 1.6) + 0.6
+    block = max(m * (0.08 + 0.15 * max(1 + one.count("\n") for one in signals)), 1.6) + 0.6
     if narrow:
         height = (block + MAP_IN) * len(shown) + 0.8
-        figure = new_figure(12, height, LEAST_SHARE * height)
+        figure = new_figure(12, height)
         every: Any = figure.subplots(2 * len(shown), 1, height_ratios=(block, MAP_IN) * len(shown))
         axes = every.reshape(len(shown), 2)
     else:

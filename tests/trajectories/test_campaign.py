@@ -73,7 +73,7 @@ def scripted(straight: Model, straight_motion: Motion, monkeypatch: pytest.Monke
         motion = simulate(model, straight_motion.u[: round(100 * seconds) + 1])
         return Design("worst", None, motion, 1, 1, 1, {}, 0, (1.0,), True)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(campaign, "design", cut)
+    monkeypatch.setattr(campaign, "design_drive", cut)
     return straight
 
 
