@@ -342,11 +342,21 @@ def _without_idle(before: ExtendedFit, stage: ExtendedFit, idle: set[str], dropp
     One that is idle for the second time is dropped for good.
     """
     while names := [n for n in added(before, stage) if _is_idle(n, stage) or not is_plausible(n, stage)]:
+        shorter = refit(_without(stage, names), stage)
+        if _needed(names, stage, shorter):
+            return stage
         dropped.update({n: "its size is impossible" for n in names if not is_plausible(n, stage)})
         dropped.update({n: "its size is about zero" for n in names if n in idle and n not in dropped})
         idle.update(names)
-        stage = refit(_without(stage, names), stage)
+        stage = shorter
     return stage
+
+
+def _needed(names: Sequence[str], stage: ExtendedFit, without: ExtendedFit) -> bool:
+    """Tell if a fit needs effects although their magnitudes, given shapes that it hardly knows, may be zero."""
+    if not stage.exact or not all(is_plausible(n, stage) for n in names):
+        return False
+    return not without.exact or without.deviance - stage.deviance > MIN_LIKELIHOOD_RATIO * stage.dispersion
 
 
 def _fits_without(before: ExtendedFit, stage: ExtendedFit, runner: CallRunner) -> dict[str, ExtendedFit | None]:

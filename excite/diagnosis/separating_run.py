@@ -168,10 +168,6 @@ def _longest_motion(stage: ExtendedFit) -> SampledMotion:
     k = int(np.argmax([len(log) for log in stage.data.logs]))
     p, change = fit.trajectories[k], stage.data.measurements[k]
     q, nu, _, u, a = smoothed_motion(space, change, p, fit.X)
-    root = stage.machine.body[0].coordinates
-    if stage.machine.planar and root[2] in stage.model.coordinates:
-        heading = stage.model.coordinates.index(root[2])
-        q[:, heading] = np.cumsum(nu[:, heading]) / float(stage.machine.sampling_hz)
     t = np.arange(len(u)) / float(stage.machine.sampling_hz)
     step = max(1, len(u) // MAX_SAMPLES)
     return SampledMotion(*(x[::step] for x in (q, nu, a, u, t)))

@@ -265,24 +265,31 @@ def smoothed_motion(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the motion of a trajectory: q, nu (N, n_q), memory (N, n_z), delivered torques u (N, n_u),
     accelerations (N, n_q)."""
-    q, nu, z = space.unpack(trajectory.state)
+    q, nu, z = _with_heading(space, trajectory.state)
     z[:, z.shape[1] - trajectory.ground_inputs.shape[1] :] = trajectory.ground_inputs
     u = space.delivered_torques(data.torque, X)[0] + trajectory.sampled_torque_error
     known = () if space.model.plain else (z.T,)
     return q, nu, z, u, space.model.acceleration(q.T, nu.T, u.T, *known, X).full().T
 
 
+def _with_heading(space: StateSpace, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Split states as `unpack`, with a heading that follows from its speed, from zero, where it is no state."""
+    q, nu, z = space.unpack(state)
+    machine, coordinates = space.model.machine, space.model.coordinates
+    if machine.planar and machine.body[0].coordinates[2] in coordinates:
+        k = coordinates.index(machine.body[0].coordinates[2])
+        if k not in space.index:
+            rate = float(machine.sampling_hz)
+            q[:, k] = scipy.integrate.cumulative_trapezoid(nu[:, k], dx=1 / rate, initial=0)
+    return q, nu, z
+
+
 def transfer_trajectory(
     space: StateSpace, data: Measurements, trajectory: Trajectory, source: StateSpace, X: np.ndarray
 ) -> Trajectory:
     """Convert a trajectory from the state space `source` of the same machine and sensors with other effects."""
-    q, nu, _ = source.unpack(trajectory.state)
-    machine, rate = space.model.machine, float(space.model.machine.sampling_hz)
+    q, nu, _ = _with_heading(source, trajectory.state)
     n_q, n_z = len(space.model.coordinates), len(space.model.memory)
-    if machine.planar and machine.body[0].coordinates[2] in space.model.coordinates:
-        k = space.model.coordinates.index(machine.body[0].coordinates[2])
-        if k not in source.index:
-            q[:, k] = scipy.integrate.cumulative_trapezoid(nu[:, k], dx=1 / rate, initial=0)
     full = np.zeros((len(trajectory.state), space.full_size))
     shared = source.index < source.full_size - len(source.model.memory)
     full[:, source.index[shared]] = trajectory.state[:, shared]
