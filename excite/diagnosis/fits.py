@@ -131,8 +131,15 @@ class ExtendedFit:
 
     @property
     def excess_cost(self) -> float:
-        """Cost beyond what noise may cause."""
-        return max(0.0, self.fit.cost - self.data.noise_cost)
+        """Cost beyond what noise may cause, whose level nobody knows well where its tails are heavy."""
+        return max(0.0, self.fit.cost - self.data.noise_cost - self._heavy_cost)
+
+    @property
+    def _heavy_cost(self) -> float:
+        """Cost beyond its expected value in signals whose innovations have heavy tails."""
+        every = [z[np.isfinite(z)] for linear in self.fit.linear for z in linear.innovations.T]
+        heavy = [z for z in every if smoothing.normal_scores(z) is not z]
+        return sum(max(0.0, float(z @ z) - len(z)) for z in heavy)
 
     @cached_property
     def deviance(self) -> float:

@@ -39,7 +39,8 @@ class HoldOutErrors:
     sensors (m): names and units. squares (stretches, m) [SI squared]: sums of squared errors. counts (stretches, m):
     number of readings. signal_variance (m,): mean variance of a signal within a stretch. noise_variance (m,): variance
     of a reading. turn (stretches,): stretches of one turn are hidden at once. log_likelihood (stretches,): of the
-    readings of a stretch given all before them, with the parameters of the rest; NaN if it was not asked for.
+    readings of a stretch given all before them, with the parameters of the rest; NaN if it was not asked for, or if
+    unknown forces stand beside the model.
     """
 
     sensors: tuple[tuple[str, str], ...]
@@ -214,7 +215,9 @@ def _errors_of_turn(
         np.mean(motion, axis=0),
         np.mean(noise, axis=0),
         np.full(len(squares), turn),
-        _likelihood_of_stretches(stage, rest, stretches) if likelihood else np.full(len(squares), np.nan),
+        _likelihood_of_stretches(stage, rest, stretches)
+        if likelihood and stage.exact  # unknown forces fit what the model does not predict
+        else np.full(len(squares), np.nan),
     )
 
 

@@ -17,7 +17,7 @@ import scipy.stats
 from excite.diagnosis.spectrum import FALSE_ALARM_PROBABILITY, strongest_line
 from excite.logs import Log, white_noise
 from excite.model.machine import Machine, Sensor
-from excite.smoothing import Fit
+from excite.smoothing import Fit, normal_scores
 
 MIN_READINGS = 50  # readings of a signal that are tested; chosen
 OUTLIER_MARGIN = 1.6  # factor on the threshold of outliers, as encoder edges have no normal errors; chosen
@@ -120,7 +120,8 @@ def _innovation_anomalies(name: str, t: np.ndarray, z: np.ndarray, rate: float, 
     count = int(valid.sum())
     if count < MIN_READINGS:
         return
-    own = np.where(valid, z, 0.0)
+    own = np.zeros(len(z))
+    own[valid] = z[valid] if counts else normal_scores(z[valid])
     limit = OUTLIER_MARGIN * float(scipy.stats.norm.isf(FALSE_ALARM_PROBABILITY / count / 2))
     k = int(np.argmax(np.abs(own)))
     if abs(own[k]) > limit:

@@ -19,7 +19,7 @@ import scipy
 from excite.identification.estimate import FitTest
 from excite.identification.white_residuals import SIMULATIONS, Courses, WhiteResiduals
 from excite.model import Model
-from excite.smoothing import torque_sensor
+from excite.smoothing import normal_scores, torque_sensor
 from excite.text import format_number
 
 FALSE_ALARM = 1e-3  # probability that any test of a right estimate fails, were the machine linear; chosen
@@ -142,6 +142,7 @@ def _noise_tests(one: WhiteResiduals) -> list[FitTest]:
         if len(used) < 4 * LAGS:
             continue
         z = one.z[used, j].astype(float)
+        z = z if one.counted[j] else normal_scores(z)
         noise = one.noise[used, j].astype(float)
 
         def add(what: str, statistic: tuple[np.ndarray, float], text: str, count: int = 1) -> None:

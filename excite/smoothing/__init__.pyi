@@ -57,6 +57,7 @@ from .sizes import (
     sizes_step as sizes_step,
 )
 from .solver import Settings as Settings
+from .tails import normal_scores as normal_scores
 from .transitions import (
     Transitions as Transitions,
     differentiate as differentiate,

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from excite.smoothing.block_tridiagonal import gather, inverse_blocks
 from excite.smoothing.discrepancy import Basis
@@ -25,13 +24,11 @@ from excite.smoothing.inverse import (
 from excite.smoothing.inverse_chain import Chain
 from excite.smoothing.motion_readings import predicted, reading_freedom
 from excite.smoothing.splines import ORDER, jerk_penalty, squared_jerk
+from excite.smoothing.tails import heaviness
 
-TAILS = (np.inf, 30.0, 12.0, 7.0, 5.0, 4.0, 3.0)  # degrees of freedom of Student's t that are compared
 CORRELATED = 0.25  # mean correlation over five slots from which residuals are not white; smoothed noise has up to 0.2
 BLOCK_COUNTS = (20, 60)  # blocks of a log whose scores are summed: what lasts a twentieth of it counts in full
-MANY_RESIDUALS = 5000  # that show tails well enough
 JERK_TAILS = 2.0  # degrees of freedom of Student's t of the jerk: reversals and steps are rare and large
-TAIL_GAIN = 3.0  # of log-likelihood from which tails are heavier than normal
 
 
 @dataclass
@@ -86,7 +83,7 @@ def update_sizes(
     left = np.maximum(found.number - found.spent - freedom / n, 0.05 * found.number)
     noise = np.maximum(np.sqrt(found.square / np.maximum(left, 1e-300)), problem.least_noise)
     jerk = sizes.jerk * np.clip(found.roughness / np.maximum(found.rough_free, 1e-3) / sizes.jerk, 0.1, 10.0)
-    tails = sizes.tails if first else np.array([_tails(np.concatenate(own)) for own in found.standard])
+    tails = sizes.tails if first else np.array([heaviness(np.concatenate(own))[0] for own in found.standard])
     lively = tuple(
         np.column_stack([(JERK_TAILS + own[m]) / (JERK_TAILS + 1) for own in found.expected])
         for m in range(len(problem.chains))
@@ -162,25 +159,6 @@ def _determinant_slope(
     motion = part.motion(point.coefficients[m]).reshape(len(part.t), -1)
     flat = V.transpose(0, 2, 1).reshape(len(part.t), -1)
     return problem.torque.contraction(motion, *part.beside, point.X, flat)[0][:, :, 0].sum(axis=0)
-
-
-def _tails(z: np.ndarray) -> float:
-    """Return the degrees of freedom of Student's t under which standardised residuals z (N,) are most likely."""
-    best, chosen = -np.inf, np.inf
-    z = z[:: 1 + len(z) // MANY_RESIDUALS]
-    for nu in TAILS:
-        if np.isinf(nu):
-            scale = float(np.sqrt(np.mean(z**2)))
-            value = float(scipy.stats.norm.logpdf(z, scale=scale).sum()) + TAIL_GAIN
-        else:
-            scale = float(np.sqrt(np.mean(z**2)))
-            for _ in range(8):
-                weight = (nu + 1) / (nu + (z / scale) ** 2)
-                scale = float(np.sqrt(np.mean(weight * z**2)))
-            value = float(scipy.stats.t.logpdf(z, nu, scale=scale).sum())
-        if value > best:
-            best, chosen = value, nu
-    return chosen
 
 
 def correlation_factor(
