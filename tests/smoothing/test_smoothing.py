@@ -26,6 +26,7 @@ from excite.smoothing import (
     BatchedFunction,
     NotConvergedError,
     Settings,
+    Trajectory,
     build_state_space,
     common_sensors,
     differentiate,
@@ -35,6 +36,7 @@ from excite.smoothing import (
     newton_step,
     parallel_smoother,
     prepare_measurements,
+    smoothed_motion,
     uncertainty,
 )
 from excite.smoothing.measurements import beat_inflation
@@ -387,6 +389,21 @@ def design(name: str) -> np.ndarray:
     """Torques (N, 3) of a committed study's design."""
     table = pd.read_csv(Path(__file__).parents[2] / "results" / name / "design" / "profile.csv")
     return table[["u1_Nm", "u2_Nm", "u4_Nm"]].to_numpy()
+
+
+def test_a_motion_has_the_heading_that_was_driven_even_where_no_state_has_it(va12: Model) -> None:
+    """The roller's dynamics do not depend on it, but a slope that they lack acts along it."""
+    motion = simulate(va12, energetic(20.0))
+    log = measured(va12, motion, va12.nominal, seed=8)
+    c = build_state_space(va12, common_sensors(va12, [log]))
+    k = va12.coordinates.index(va12.machine.body[0].coordinates[2])
+    assert k not in c.index
+    records = prepare_measurements(c, log)
+    states, ground = c.from_motion(motion)
+    exact = Trajectory(states, np.zeros((len(states) - 1, 3)), np.zeros(len(records.offset_sensors)), ground)
+    heading = smoothed_motion(c, records, exact, va12.nominal)[0][:, k]
+    assert np.ptp(motion.q[:, k]) > 0.1
+    assert heading == pytest.approx(motion.q[:, k] - motion.q[0, k], abs=1e-3)
 
 
 @pytest.mark.slow
