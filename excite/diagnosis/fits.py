@@ -40,7 +40,7 @@ from excite.text import format_number
 
 # Cost: sum of squared innovations over their variances. A right model's cost is about the number of readings.
 TRACKING_COST_RATIO = 2.5  # cost over its expected value up to which exact dynamics follow the logs; chosen
-LOST_COST_RATIO = 10.0  # cost over its expected value from which a fit from the start is given up; chosen
+LOST_COST_RATIO = 10.0  # the same with some of several effects in the model, and from which a fit is given up; chosen
 FRICTION_ERROR = 0.1  # share of friction near rest by which an effect's formula may err there; chosen
 CHANCE_STDS = 4.0  # standard deviations of a sum of squares that are no chance
 COST_TOLERANCE = 0.02  # share of its expected value by which a right model's cost may be larger; chosen
@@ -308,8 +308,8 @@ def _follow(
 
     exactly: fit nothing beside the model.
     """
-    limit = TRACKING_COST_RATIO * data.n_readings
-    lost = (LOST_COST_RATIO if settings is FROM_START else TRACKING_COST_RATIO) * data.n_readings
+    limit = (LOST_COST_RATIO if settings is RESUMED else TRACKING_COST_RATIO) * data.n_readings
+    lost = (TRACKING_COST_RATIO if settings is COMPARED else LOST_COST_RATIO) * data.n_readings
     fit = smoothing.fit_logs(
         data.space,
         data.measurements,
