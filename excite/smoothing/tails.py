@@ -11,15 +11,11 @@ import scipy.stats
 
 FREEDOMS = (np.inf, 30.0, 12.0, 7.0, 5.0, 4.0, 3.0)  # degrees of freedom that are compared
 MANY_RESIDUALS = 5000  # that show tails well enough
-TAIL_GAIN = 3.0  # of log-likelihood from which tails are heavier than normal
-SCALE_PASSES = 8  # of the fixed point of the scale
-TRIMMED_SHARE = 1e-3  # share of the largest residuals that say nothing of the tails, as they may be faults; chosen
 PART_RESIDUALS = 100  # in a part of a log whose own size shows if tails are heavy there; chosen
-LEAST_RESIDUALS = 500  # that show tails at all; chosen
 CLEAR_GAIN = 12.0  # of log-likelihood from which tails of innovations are heavier than normal, for some 20 signals
 
 
-def heaviness(z: np.ndarray, gain: float = TAIL_GAIN) -> tuple[float, float]:
+def heaviness(z: np.ndarray, gain: float = 3.0) -> tuple[float, float]:
     """Return the degrees of freedom and the scale of Student's t under which residuals z (N,) are most likely.
 
     gain: of log-likelihood over the normal distribution (infinitely many degrees) that it takes.
@@ -31,7 +27,7 @@ def heaviness(z: np.ndarray, gain: float = TAIL_GAIN) -> tuple[float, float]:
         if np.isinf(nu):
             value = float(scipy.stats.norm.logpdf(z, scale=scale).sum()) + gain
         else:
-            for _ in range(SCALE_PASSES):
+            for _ in range(8):
                 weight = (nu + 1) / (nu + (z / scale) ** 2)
                 scale = float(np.sqrt(np.mean(weight * z**2))) or 1.0
             value = float(scipy.stats.t.logpdf(z, nu, scale=scale).sum())
@@ -46,11 +42,11 @@ def normal_scores(z: np.ndarray) -> np.ndarray:
     Each goes to the same quantile. Unchanged without heavy tails. A few large residuals in normal noise, and residuals
     that are large for a while, are none.
     """
-    if len(z) < LEAST_RESIDUALS:
+    if len(z) < 5 * PART_RESIDUALS:
         return z
     parts = np.array_split(z, len(z) // PART_RESIDUALS)
     local = np.concatenate([part / (np.sqrt(np.mean(part**2)) or 1.0) for part in parts])
-    limit = np.quantile(np.abs(local), 1 - TRIMMED_SHARE)
+    limit = np.quantile(np.abs(local), 1 - 0.1 / PART_RESIDUALS)  # the largest may be faults
     if np.isinf(heaviness(local[np.abs(local) < limit], CLEAR_GAIN)[0]):
         return z
     nu, scale = heaviness(z)
