@@ -132,14 +132,7 @@ class ExtendedFit:
     @property
     def excess_cost(self) -> float:
         """Cost beyond what noise may cause, whose level nobody knows well where its tails are heavy."""
-        return max(0.0, self.fit.cost - self.data.noise_cost - self._heavy_cost)
-
-    @property
-    def _heavy_cost(self) -> float:
-        """Cost beyond its expected value in signals whose innovations have heavy tails."""
-        every = [z[np.isfinite(z)] for linear in self.fit.linear for z in linear.innovations.T]
-        heavy = [z for z in every if smoothing.normal_scores(z) is not z]
-        return sum(max(0.0, float(z @ z) - len(z)) for z in heavy)
+        return max(0.0, self.fit.cost - self.data.noise_cost - float(heavy_excess(self.fit).sum()))
 
     @cached_property
     def deviance(self) -> float:
@@ -261,6 +254,17 @@ class ExtendedFit:
     def parameters_of(self, name: str) -> list[int]:
         """Return the places of an effect's magnitude and shapes among the base parameters."""
         return [k for k, n in enumerate(self.model.base.names) if n == name or n.startswith(f"{name}.")]
+
+
+def heavy_excess(fit: Fit) -> np.ndarray:
+    """Return by sensor (m,) the sum of squares, beyond their number, of innovations with heavy tails."""
+    total = np.zeros(fit.linear[0].residual.shape[1])
+    for linear in fit.linear:
+        for j, z in enumerate(linear.innovations.T):
+            own = z[np.isfinite(z)]
+            if smoothing.normal_scores(own) is not own:
+                total[j] += max(0.0, float(own @ own) - len(own))
+    return total
 
 
 def fit_machine(
