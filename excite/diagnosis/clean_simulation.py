@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from excite import identification
-from excite.diagnosis.fits import RESUMED, ExtendedFit, heavy_excess
+from excite.diagnosis.fits import RESUMED, ExtendedFit
 from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.residuals import concentrations, residuals_of_logs
 from excite.errors import SimulationError
@@ -77,7 +77,7 @@ def measure_remainder(stage: ExtendedFit, runner: CallRunner = run_in_turn, seed
         return None
     own, counts = _sum_squares(stage.fit)
     clean = np.mean([squares / np.maximum(n, 1) for squares, n in found], axis=0) * counts
-    left, total = own - heavy_excess(stage.fit) - clean, float(counts.sum())
+    left, total = own - stage.heavy_excess - clean, float(counts.sum())
     std = float(np.sqrt(2 * total * (1 + 1 / len(found))))
     chi2 = float(left.sum())
     if chi2 < MIN_STDS * std:

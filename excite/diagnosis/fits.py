@@ -132,7 +132,20 @@ class ExtendedFit:
     @property
     def excess_cost(self) -> float:
         """Cost beyond what noise may cause, whose level nobody knows well where its tails are heavy."""
-        return max(0.0, self.fit.cost - self.data.noise_cost - float(heavy_excess(self.fit).sum()))
+        return max(0.0, self.fit.cost - self.data.noise_cost - float(self.heavy_excess.sum()))
+
+    @property
+    def heavy_excess(self) -> np.ndarray:
+        """Sum of squares by sensor (m,), beyond their number, of innovations with heavy tails; none of an encoder."""
+        sensors = self.data.space.sensors
+        total = np.zeros(len(sensors))
+        for linear in self.fit.linear:
+            for j, sensor in enumerate(sensors):
+                z = linear.innovations[:, j]
+                z = z[np.isfinite(z)]
+                if sensor.resolution is None and smoothing.has_heavy_tails(z):
+                    total[j] += max(0.0, float(z @ z) - len(z))
+        return total
 
     @cached_property
     def deviance(self) -> float:
@@ -254,17 +267,6 @@ class ExtendedFit:
     def parameters_of(self, name: str) -> list[int]:
         """Return the places of an effect's magnitude and shapes among the base parameters."""
         return [k for k, n in enumerate(self.model.base.names) if n == name or n.startswith(f"{name}.")]
-
-
-def heavy_excess(fit: Fit) -> np.ndarray:
-    """Return by sensor (m,) the sum of squares, beyond their number, of innovations with heavy tails."""
-    total = np.zeros(fit.linear[0].residual.shape[1])
-    for linear in fit.linear:
-        for j, z in enumerate(linear.innovations.T):
-            own = z[np.isfinite(z)]
-            if smoothing.normal_scores(own) is not own:
-                total[j] += max(0.0, float(own @ own) - len(own))
-    return total
 
 
 def fit_machine(

@@ -208,6 +208,7 @@ def _errors_of_turn(
             counts.append(valid.sum(axis=0))
             motion.append(h[a:b].var(axis=0))
     sensors = tuple((s.name, space.model.machine.si_unit(s)) for s in space.sensors)
+    told = likelihood and stage.exact  # unknown forces fit what the model does not predict
     return HoldOutErrors(
         sensors,
         np.array(squares),
@@ -215,9 +216,7 @@ def _errors_of_turn(
         np.mean(motion, axis=0),
         np.mean(noise, axis=0),
         np.full(len(squares), turn),
-        _likelihood_of_stretches(stage, rest, stretches)
-        if likelihood and stage.exact  # unknown forces fit what the model does not predict
-        else np.full(len(squares), np.nan),
+        _likelihood_of_stretches(stage, rest, stretches) if told else np.full(len(squares), np.nan),
     )
 
 

@@ -57,7 +57,10 @@ from .sizes import (
     sizes_step as sizes_step,
 )
 from .solver import Settings as Settings
-from .tails import normal_scores as normal_scores
+from .tails import (
+    has_heavy_tails as has_heavy_tails,
+    normal_scores as normal_scores,
+)
 from .transitions import (
     Transitions as Transitions,
     differentiate as differentiate,

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import scipy.integrate
 
 from excite.errors import NotIdentifiableError
 from excite.logs import Log, integrate_pose, passes, remember, samples, white_noise
@@ -279,8 +278,7 @@ def _with_heading(space: StateSpace, state: np.ndarray) -> tuple[np.ndarray, np.
     if machine.planar and machine.body[0].coordinates[2] in coordinates:
         k = coordinates.index(machine.body[0].coordinates[2])
         if k not in space.index:
-            rate = float(machine.sampling_hz)
-            q[:, k] = scipy.integrate.cumulative_trapezoid(nu[:, k], dx=1 / rate, initial=0)
+            q[:, k] = integrate_pose(space.model, q, nu, 1 / float(machine.sampling_hz))[:, k]
     return q, nu, z
 
 

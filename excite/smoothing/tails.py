@@ -36,18 +36,25 @@ def heaviness(z: np.ndarray, gain: float = 3.0) -> tuple[float, float]:
     return found
 
 
-def normal_scores(z: np.ndarray) -> np.ndarray:
-    """Return residuals z (N,) of noise with heavy tails as those of normal noise of the same size would be.
+def has_heavy_tails(z: np.ndarray) -> bool:
+    """Tell if residuals z (N,) are of noise with heavy tails.
 
-    Each goes to the same quantile. Unchanged without heavy tails. A few large residuals in normal noise, and residuals
-    that are large for a while, are none.
+    A few large residuals in normal noise, and residuals that are large for a while, are none.
     """
     if len(z) < 5 * PART_RESIDUALS:
-        return z
+        return False
     parts = np.array_split(z, len(z) // PART_RESIDUALS)
     local = np.concatenate([part / (np.sqrt(np.mean(part**2)) or 1.0) for part in parts])
     limit = np.quantile(np.abs(local), 1 - 0.1 / PART_RESIDUALS)  # the largest may be faults
-    if np.isinf(heaviness(local[np.abs(local) < limit], CLEAR_GAIN)[0]):
+    return bool(np.isfinite(heaviness(local[np.abs(local) < limit], CLEAR_GAIN)[0]))
+
+
+def normal_scores(z: np.ndarray) -> np.ndarray:
+    """Return residuals z (N,) of noise with heavy tails as those of normal noise of the same size would be.
+
+    Each goes to the same quantile. Unchanged without heavy tails.
+    """
+    if not has_heavy_tails(z):
         return z
     nu, scale = heaviness(z)
     score = -scipy.special.ndtri_exp(scipy.stats.t.logsf(np.abs(z) / scale, nu))

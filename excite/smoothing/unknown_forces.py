@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
-import scipy
 
+from excite.logs import integrate_pose
 from excite.model.machine import Body
 from excite.simulation import smooth_part
 from excite.smoothing.linearisation import SLOPES, StateSpace, feature_names
@@ -298,7 +298,7 @@ def _entries(
             add(f"{where}: torque with angle", unit, 0.005 * large, harmonics, k, 4)
     for body in machine.contacts:
         found += _contact_entries(space, body, features, X, slips, slow, rate)
-    found += _slope_entries(space, nu, rate)
+    found += _slope_entries(space, q, nu, rate)
     for j, sensor in enumerate(space.sensors):
         if sensor.kind == "wheel":
             turn = np.column_stack([np.sin(data.reading[:, j]), np.cos(data.reading[:, j]) - 1])
@@ -374,7 +374,7 @@ def _contact_entries(
     return found
 
 
-def _slope_entries(space: StateSpace, nu: np.ndarray, rate: float) -> list[_Entry]:
+def _slope_entries(space: StateSpace, q: np.ndarray, nu: np.ndarray, rate: float) -> list[_Entry]:
     """Return the slope of the ground in one log, whose heading at the start is unknown."""
     first = space.n_inputs - len(space.forces)
     at = {kind: first + i for i, (_, kind) in enumerate(space.forces) if kind in SLOPES}
@@ -383,8 +383,7 @@ def _slope_entries(space: StateSpace, nu: np.ndarray, rate: float) -> list[_Entr
     root = space.model.machine.body[0].coordinates[2]
     if len(at) == 1 or root not in space.model.coordinates:
         return [_Entry("slope", "m/s2", 0.02, False, tuple((k, np.ones((len(nu), 1))) for k in at.values()), 1)]
-    yaw = nu[:, space.model.coordinates.index(root)]
-    heading = scipy.integrate.cumulative_trapezoid(yaw, dx=1 / rate, initial=0)
+    heading = integrate_pose(space.model, q, nu, 1 / rate)[:, space.model.coordinates.index(root)]
     c, s = np.cos(heading), np.sin(heading)
     shapes = ((at[SLOPES[0]], np.column_stack([c, s])), (at[SLOPES[1]], np.column_stack([-s, c])))
     return [_Entry("slope", "m/s2", 0.02, False, shapes, 2)]
