@@ -126,10 +126,6 @@ class ExtendedFit:
         return not unknown.count and not any(x.force_std.any() for x in unknown.lacking)
 
     @property
-    def expected_cost(self) -> float:
-        return self.data.n_readings
-
-    @property
     def excess_cost(self) -> float:
         """Cost beyond what noise may cause, whose level nobody knows well where its tails are heavy."""
         return max(0.0, self.fit.cost - self.data.noise_cost - float(self.heavy_excess.sum()))
@@ -158,8 +154,8 @@ class ExtendedFit:
 
     @property
     def is_close(self) -> bool:
-        """Tell if the cost is near its expected value."""
-        return self.fit.cost <= CLOSE_FIT_COST_RATIO * self.expected_cost
+        """Tell if the cost is near that of a right model."""
+        return self.fit.cost <= CLOSE_FIT_COST_RATIO * self.data.n_readings
 
     @cached_property
     def lacking(self) -> smoothing.UnknownForces:
@@ -218,7 +214,7 @@ class ExtendedFit:
     @property
     def dispersion(self) -> float:
         """Ratio of the cost to its expected value, at least 1: likelihood ratios count less by this factor."""
-        return max(1.0, self.fit.cost / self.expected_cost)
+        return max(1.0, self.fit.cost / self.data.n_readings)
 
     @property
     def std_inflation(self) -> float:
@@ -308,11 +304,11 @@ Fitted = tuple[Fit, tuple[Measurements, ...]]
 
 
 def _follow(
-    data: FitData, trajectories: Sequence[Trajectory], X: np.ndarray, settings: Settings, exactly: bool = False
+    data: FitData, trajectories: Sequence[Trajectory], X: np.ndarray, settings: Settings, most: float | None = None
 ) -> Fitted:
     """Fit exact dynamics, or beside unknown forces if these do not follow the logs. Raises NotConvergedError.
 
-    exactly: fit nothing beside the model.
+    most: cost from which a fit is given up that has nothing beside the model.
     """
     limit = (LOST_COST_RATIO if settings is RESUMED else TRACKING_COST_RATIO) * data.n_readings
     lost = (TRACKING_COST_RATIO if settings is COMPARED else LOST_COST_RATIO) * data.n_readings
@@ -323,13 +319,13 @@ def _follow(
         X,
         data.starts,
         data.held,
-        settings=replace(settings, cost_limit=lost),
+        settings=replace(settings, cost_limit=lost if most is None else min(lost, most)),
     )
     # Of a dull drive the next step may be long although the cost is that of noise.
     near = data.noise_cost if fit.status == "stopped" else CLOSE_FIT_COST_RATIO * data.n_readings
     if fit.linear and fit.cost <= (limit if fit.step <= smoothing.ACCEPTABLE_STEP else near):
         return without_smoother_levels(fit), data.measurements
-    if exactly:
+    if most is not None:
         raise NotConvergedError("exact dynamics do not follow the logs")
     beside = smoothing.fit_unknown_forces(
         data.space, data.measurements, data.starts, data.held, ROUNDS_BESIDE, True, (X, trajectories)
@@ -360,23 +356,27 @@ def refit(machine: Machine, previous: ExtendedFit) -> ExtendedFit:
 
 
 def refit_all(
-    machines: Sequence[Machine], previous: ExtendedFit, runner: CallRunner, held: Sequence[str] = ()
+    machines: Sequence[Machine],
+    previous: ExtendedFit,
+    runner: CallRunner,
+    held: Sequence[str] = (),
+    most: float = np.inf,
 ) -> Iterator[ExtendedFit | None]:
     """Refit several machines side by side with exact dynamics; None for each that does not follow the logs.
 
-    held: for each machine a parameter that stays at its file's value.
+    held: for each machine a parameter that stays at its file's value. most: cost from which a fit is given up.
     """
     begun = [_continued(machine, previous) for machine in machines]
     if held:
         begun = [(_hold_parameter(data, name), s, X) for (data, s, X), name in zip(begun, held, strict=True)]
-    calls: list[Callable[[], Any]] = [partial(_follow_or_none, *own) for own in begun]
+    calls: list[Callable[[], Any]] = [partial(_follow_or_none, *own, most) for own in begun]
     for machine, (data, *_), fitted in zip(machines, begun, runner(calls), strict=True):
         yield None if fitted is None else ExtendedFit(machine, data, *fitted)
 
 
-def _follow_or_none(data: FitData, trajectories: Sequence[Trajectory], X: np.ndarray) -> Fitted | None:
+def _follow_or_none(data: FitData, trajectories: Sequence[Trajectory], X: np.ndarray, most: float) -> Fitted | None:
     try:
-        return _follow(data, trajectories, X, COMPARED, True)
+        return _follow(data, trajectories, X, COMPARED, most)
     except NotConvergedError:
         return None
 

@@ -47,17 +47,6 @@ def run_in_turn(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
     return (call() for call in calls)
 
 
-def run_ahead(calls: Sequence[Callable[[], R]], runner: CallRunner) -> Generator[R, None, None]:
-    """Run calls, the first at once if there are processes for it, while this process goes on."""
-    results: Generator[Any, None, None] = runner([_do_nothing, *calls])
-    next(results)
-    return results
-
-
-def _do_nothing() -> None:
-    pass
-
-
 def run_forked(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
     """Run calls in as many forked processes at a time as there are cores, and yield results in order.
 

@@ -9,7 +9,8 @@ innovations. Sensor noise in slips and speeds, which gives least-squares residua
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from itertools import product
 
 import casadi as ca
@@ -261,6 +262,23 @@ def beside(fitted_log: FittedLog, lacking: Lacking) -> FittedLog:
     return replace(fitted_log, white=replace(white, E=np.concatenate([white.E, more], axis=2)))
 
 
+@dataclass(frozen=True)
+class _Acting:
+    """Effects, each by itself, on a machine without any; key: what tells them from others."""
+
+    key: str
+    machine: Machine = field(compare=False)
+    standard: tuple[str, ...] = field(compare=False)
+    placed: Sequence[PlacedEffect] = field(compare=False)
+
+
+@lru_cache(maxsize=1)
+def _functions(acting: _Acting) -> tuple[SignatureFunctions, BatchedFunction, BatchedFunction]:
+    """Build signatures, and the same of forces and of readings for many samples; stages of a search share them."""
+    found = signatures(acting.machine, acting.standard, acting.placed)
+    return found, BatchedFunction(found.force, (7,)), BatchedFunction(found.reading, (7,))
+
+
 class SignatureColumns:
     """Signatures of candidates along one fitted log."""
 
@@ -275,8 +293,9 @@ class SignatureColumns:
                 values = {**x.placed.values, **shift}
                 every.append(replace(x.placed, values=values))
         standard = tuple(n for n in model.base.standard if "@" not in n)
-        functions = signatures(model.machine, standard, every)
-        self.force, self.reading = BatchedFunction(functions.force, (7,)), BatchedFunction(functions.reading, (7,))
+        bare = model.machine.model_copy(update={"effect": ()})
+        key = repr((bare.model_dump(), standard, [(e.name, e.sensors, sorted(e.values.items())) for e in every]))
+        functions, self.force, self.reading = _functions(_Acting(key, bare, standard, every))
         self.rows = [model.reading_names.index(s.name) for s in space.sensors]
         self.p = fitted_log.standard[: len(standard)]
         memory = integrate_memory(

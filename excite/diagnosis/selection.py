@@ -82,13 +82,16 @@ def search(before: ExtendedFit, runner: CallRunner, report: ProgressCallback, de
     if before.data.sticks:
         report(0.1, "fitting friction near rest")
         stage = _with_presliding(before, runner)
-    n_candidates, without, idle = 1, dict[str, ExtendedFit | None](), set[str]()
+    n_candidates, every, without, idle = 1, None, dict[str, ExtendedFit | None](), set[str]()
     for turn in range(MAX_TURNS):
         report(0.1 + 0.1 * turn, "scoring effects")
-        form = stage.form([x for x in candidates_of(stage) if x.name not in dropped], runner)
+        every = stage.form(_every_candidate(stage), runner)
+        further = candidates_of(stage, every.candidates)
+        form = replace(every, candidates=tuple(x for x in further if x.name not in dropped))
         n_candidates = max(n_candidates, len({x.name for x in form.candidates}))
         found = evidence.choose(form, {e.name for e in stage.model.effects})
-        chosen = _first_of(found, MAX_EFFECTS - len(added(before, stage)))
+        n = MAX_EFFECTS - len(added(before, stage))
+        chosen = replace(found, candidates=found.candidates[:n], factors=found.factors[:n], gains=found.gains[:n])
         if deadline.is_over():
             break
         if chosen.candidates:
@@ -104,9 +107,9 @@ def search(before: ExtendedFit, runner: CallRunner, report: ProgressCallback, de
         stage.release()
         if better is None:
             break
-        stage, without = better, {}
+        stage, without, every = better, {}, None
     report(0.85, "comparing rivals")
-    stage, choices = _judged(before, stage, without, runner, deadline)
+    stage, choices = _judged(before, stage, without, every, runner, deadline)
     return Search(stage, choices, found.left, n_candidates, dropped)
 
 
@@ -153,10 +156,10 @@ def give_up(
         stage = refit(_without(stage, list(reasons)), stage)
     except NotConvergedError:
         stage = before
-    form = stage.form(candidates_of(stage), runner)
-    left = evidence.posterior(form.reduced(), ()).gain
-    n_candidates = len({x.name for x in form.candidates})
-    stage, choices = _judged(before, stage, _fits_without(before, stage, runner), runner, deadline)
+    every = stage.form(_every_candidate(stage), runner)
+    left = evidence.posterior(every.reduced(), ()).gain
+    n_candidates = len({x.name for x in candidates_of(stage, every.candidates)})
+    stage, choices = _judged(before, stage, _fits_without(before, stage, runner), every, runner, deadline)
     return Search(stage, choices, left, n_candidates, dict(reasons))
 
 
@@ -195,16 +198,10 @@ def _with_best_shapes(stage: ExtendedFit, others: Sequence[EffectEntry], runner:
     return min([stage, *found], key=lambda x: x.deviance)
 
 
-def _first_of(found: Chosen, count: int) -> Chosen:
-    return replace(found, candidates=found.candidates[:count], factors=found.factors[:count], gains=found.gains[:count])
-
-
-def candidates_of(stage: ExtendedFit) -> list[Candidate]:
+def candidates_of(stage: ExtendedFit, every: Sequence[Candidate] | None = None) -> list[Candidate]:
     """List every effect that a model lacks, with trial values; and further harmonics of those that it has."""
     known = {e.name for e in stage.model.effects}
-    sensors = [s.name for s in stage.data.space.sensors]
-    every = score_test.candidates(stage.machine, sensors, stage.data.duration)
-    found = [x for x in every if x.name not in known or _has_harmonics(x.placed.effect)]
+    found = [x for x in every or _every_candidate(stage) if x.name not in known or _has_harmonics(x.placed.effect)]
     if not stage.data.sticks:
         return found
     known_near_rest = {e.where for e in stage.model.effects if e.unsticking}
@@ -213,6 +210,12 @@ def candidates_of(stage: ExtendedFit) -> list[Candidate]:
         for x in found
         if x.placed.effect.name != TRANSITION and not (x.placed.unsticking and x.placed.where in known_near_rest)
     ]
+
+
+def _every_candidate(stage: ExtendedFit) -> list[Candidate]:
+    """List every effect with trial values, the same for every stage of a search."""
+    sensors = [s.name for s in stage.data.space.sensors]
+    return score_test.candidates(stage.machine, sensors, stage.data.duration)
 
 
 def _has_harmonics(effect: Effect) -> bool:
@@ -404,25 +407,31 @@ def _judged(
     before: ExtendedFit,
     stage: ExtendedFit,
     without: Mapping[str, ExtendedFit | None],
+    every: evidence.Form | None,
     runner: CallRunner,
     deadline: Deadline,
 ) -> tuple[ExtendedFit, tuple[Choice, ...]]:
-    """Exchange each effect for a rival that explains the logs better, and return those that explain them as well."""
+    """Exchange each effect for a rival that explains the logs better, and return those that explain them as well.
+
+    every: form of all candidates about the stage, if there is one.
+    """
     names = added(before, stage)
     if not stage.exact or deadline.is_over() or not names:
         return stage, tuple(Choice(n, stage.wald(n), None) for n in names)
-    form = stage.form([*candidates_of(stage), *(Candidate(stage.fitted(n), (0,)) for n in names)], runner)
+    form = every or stage.form(_every_candidate(stage), runner)
+    form = replace(form, candidates=tuple(candidates_of(stage, form.candidates)))
     stage.release()
     tried = [(name, entry) for name in names for entry in _likely_rivals(form, stage, name)]
     machines = [effects.with_effects(_without(stage, [name]), entry) for name, entry in tried]
     rivals: dict[str, list[tuple[float, EffectEntry]]] = {name: [] for name in names}  # with their information
-    for (name, entry), x in zip(tried, refit_all(machines, stage, runner), strict=True):
+    most = stage.fit.cost + 2 * (stage.data.noise_cost - stage.data.n_readings) + MAX_FORMULA_RATIO
+    for (name, entry), x in zip(tried, refit_all(machines, stage, runner, most=most), strict=True):
         if x is None or _fell_to_zero(entry.label, x) or not is_plausible(entry.label, x) or x.impossible:
             continue
         told = information(x, entry.label)
         rivals[name].append((told, fitted_entry(x, entry.label)))
         if told < information(stage, name) - CLEARLY_BETTER:
-            return _judged(before, x, _fits_without(before, x, runner), runner, deadline)
+            return _judged(before, x, _fits_without(before, x, runner), None, runner, deadline)
     choices = []
     for name in names:
         fit = without.get(name)
@@ -448,14 +457,16 @@ def information(stage: ExtendedFit, name: str) -> float:
 
 def _likely_rivals(form: evidence.Form, stage: ExtendedFit, name: str) -> list[EffectEntry]:
     """Return the candidates that to first order gain about as much as an effect in its place, best first."""
-    at = stage.parameters_of(name)
+    at, itself = stage.parameters_of(name), stage.fitted(name)
     own = stage.model.base.names.index(name)
-    value = np.array([-stage.fit.X[k] / stage.model.scale[k] if k == own else 0.0 for k in at])
-    form = form.without(at, value).reduced()
+    # an effect goes with its magnitude, or with the inverse of it
+    step = float(stage.fit.X[own] / stage.model.scale[own]) * (-1 if itself.effect.inverse else 1)
+    std = evidence.factor_std(itself, stage.machine, stage.data.duration)
+    form = form.with_parameter(own, step, Candidate(itself, (0,)), std)
+    form = form.without(at, np.array([-step if k == own else 0.0 for k in at])).reduced()
     gains = evidence.first_gains(form, (), form.nothing)
-    effect_itself = max(k for k, x in enumerate(form.candidates) if x.name == name)  # the last, as fitted
     known = {e.name for e in stage.model.effects}
-    least = max(gains[effect_itself] - max(RIVAL_LOSS, RIVAL_LOSS_SHARE * gains[effect_itself]), 0.0)
+    least = max(gains[-1] - max(RIVAL_LOSS, RIVAL_LOSS_SHARE * gains[-1]), 0.0)
     best = evidence.best_of_each(form, gains, lambda x: x.name, least)
     rivals = [x for x in (form.candidates[k] for k in best) if x.name not in known][:MAX_RIVALS]
     return [_start_entry(x, evidence.posterior(form, [x], form.nothing, 0).factors(form, [x])[0]) for x in rivals]

@@ -84,11 +84,10 @@ def joint_exactly(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate
     If not, friction may stick (see `_fit_sticking`). Raises UnexplainedError if neither explains the logs.
     """
     space, measurements, starts, held = _prepare(model, logs, filter)
-    readings = sum(float(data.used.sum()) for data in measurements)
-    limit = Settings(cost_limit=LOST_COST_RATIO * readings)
-    fit = fit_logs(space, measurements, starts, model.nominal, starts, held, settings=limit)
+    fit = fit_logs(space, measurements, starts, model.nominal, starts, held, settings=_limited(measurements))
     close = fit.step <= CLOSE_STEP and not find_suspect_sensors(space, logs, fit)
-    if (not close or shows_sticking(model, logs, filter, fit)) and (stuck := _fit_sticking(model, logs, filter, held)):
+    sticks = fit.status != "converged" or shows_sticking(model, logs, filter, fit)  # as far as one can tell
+    if sticks and (stuck := _fit_sticking(model, logs, filter, held)):
         return stuck
     if not close or lacks_forces(space, measurements, starts, held, fit):
         raise UnexplainedError("the model alone does not explain the log")
@@ -113,6 +112,11 @@ def joint_beside_forces(model: Model, logs: Sequence[Log], filter: Filter) -> Es
     estimate = _build_estimate(space, around.measurements, found, filter, notes)
     moving = "" if found.step <= ACCEPTABLE_STEP else f"; {STALLED_DOUBT.format(format_number(found.step, 2))}"
     return replace(estimate, doubt=UNEXPLAINED_DOUBT + moving, discrepancy=_discrepancy(missing))
+
+
+def _limited(measurements: Sequence[Measurements]) -> Settings:
+    """Return settings of a fit that is given up where it cannot explain the logs."""
+    return Settings(cost_limit=LOST_COST_RATIO * sum(float(data.used.sum()) for data in measurements))
 
 
 def _prepare(
@@ -153,7 +157,7 @@ def _fit_sticking(model: Model, logs: Sequence[Log], filter: Filter, held: np.nd
     soft, extra = rests
     space = build_state_space(soft, common_sensors(soft, logs))
     measurements, starts = prepare_logs(space, logs, filter, unbiased=True, extra_torque_noise=extra)
-    fit = fit_logs(space, measurements, starts, model.nominal, starts, held)
+    fit = fit_logs(space, measurements, starts, model.nominal, starts, held, settings=_limited(measurements))
     if fit.step > CLOSE_STEP or find_suspect_sensors(space, logs, fit):
         return None
     fit, one_sided, flat_notes = quantify_uncertainty(space, measurements, starts, fit)

@@ -24,7 +24,6 @@ from .figure_files import (
     FigureFiles as FigureFiles,
     read_formats as read_formats,
     read_width as read_width,
-    text_faults as text_faults,
     writing_figures as writing_figures,
 )
 from .figures import (

@@ -6,7 +6,6 @@ A command or `save` sets the files once (`writing_figures`), for every figure th
 
 from __future__ import annotations
 
-import itertools
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +17,6 @@ from typing import Any
 
 import matplotlib as mpl
 from matplotlib.backends import backend_mixed, backend_pdf
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
@@ -35,7 +33,6 @@ SCREEN_DPI, PRINT_DPI = 160, 300  # of a PNG without and with a stated width; ch
 MIN_LETTERS_PT = 6.0  # smallest letters that journals print; chosen from guides that ask for 5 to 8 pt
 SMALLEST_PT = 8.0  # smallest letters of a figure on the screen, which are scaled to MIN_LETTERS_PT in print
 LEAST_SAID = 0.98  # share of MIN_LETTERS_PT below which a figure's letters are said to be small; chosen
-TOUCH_PX = 1.0  # by which boxes of texts may overlap: letters don't fill theirs
 TITLE_LETTER = 0.58  # width of a letter of the title as a share of its size, on average
 POINTS_PER_INCH = 72  # pt/in, definition
 # without dates and random names: the same data give the same bytes
@@ -138,31 +135,6 @@ def write_file(figure: Figure, path: Path, scale: float | None = None) -> None:
     else:
         density = {"dpi": (PRINT_DPI, PRINT_DPI)}
         figure.savefig(path, dpi=PRINT_DPI * scale, metadata=METADATA["png"], pil_kwargs=density)
-
-
-def text_faults(figure: Figure) -> Iterator[str]:
-    """Yield each visible text that is cut off or lies on another one."""
-    canvas: Any = FigureCanvasAgg(figure)
-    canvas.draw()
-    renderer = canvas.get_renderer()
-    found = figure.findobj(Text)
-    texts = [t for t in found if isinstance(t, Text) and t.get_visible() and t.get_text().strip()]
-    hidden = {id(t) for ax in figure.axes if not (ax.get_visible() and ax.axison) for t in ax.findobj(Text)}
-    for ax in figure.axes:
-        for axis, limits in ((ax.xaxis, ax.get_xlim()), (ax.yaxis, ax.get_ylim())):
-            low, high = sorted(limits)
-            for tick in [*axis.get_major_ticks(), *axis.get_minor_ticks()]:
-                if not low - 1e-9 * abs(low) <= tick.get_loc() <= high + 1e-9 * abs(high):
-                    hidden |= {id(tick.label1), id(tick.label2)}
-    boxes = [(t.get_text(), t.get_window_extent(renderer)) for t in texts if id(t) not in hidden]
-    whole = figure.bbox
-    for text, box in boxes:
-        if box.x0 < whole.x0 - 1 or box.x1 > whole.x1 + 1 or box.y0 < whole.y0 - 1 or box.y1 > whole.y1 + 1:
-            yield f"cut off: {text!r}"
-    for (one, a), (other, b) in itertools.combinations(boxes, 2):
-        wide, high = min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0)
-        if wide > TOUCH_PX and high > TOUCH_PX:
-            yield f"{one!r} lies on {other!r}"
 
 
 def wrap_title(figure: Figure, text: str, size: float) -> str:

@@ -85,13 +85,6 @@ class Bound:
     degree: int
     certificate: Certificate | None = field(default=None, compare=False, repr=False)
 
-    def largest_violation(self, model: Model, problem: Problem, motion: Motion) -> float:
-        """Return the largest violation of the certificate along a motion that keeps the limits."""
-        assert self.certificate is not None
-        states = _state_space(model, problem, self.degree)
-        Phi, drift, _ = states.columns(_feasible_samples(states, [motion], 1))
-        return float(_violation(Phi, drift, self.certificate).max(initial=0.0))
-
 
 Progress = Callable[[Bound], bool | None]
 

@@ -120,7 +120,7 @@ def test_a_fit_that_came_near_the_log_is_gone_on_with(
 ) -> None:
     """Though its steps were still large; far from the log it is given up."""
     stage = calm(straight)
-    ended = replace(stage.fit, status=status, step=step, cost=misfit * stage.expected_cost)
+    ended = replace(stage.fit, status=status, step=step, cost=misfit * stage.data.n_readings)
     monkeypatch.setattr(smoothing, "fit_logs", lambda *given, **more: ended)
     (tried,) = stages.refit_all([stage.machine], stage, run_in_turn)
     assert (tried is not None) == found
@@ -132,7 +132,7 @@ def test_what_exact_dynamics_do_not_follow_is_fitted_beside_unknown_forces(strai
     one = log.read_log(sloping, straight.machine)
     stage = stages.fit_machine(straight.machine, [one], straight.machine.filter)
     assert not stage.exact
-    assert stage.fit.cost < stages.TRACKING_COST_RATIO * stage.expected_cost
+    assert stage.fit.cost < stages.TRACKING_COST_RATIO * stage.data.n_readings
     (course,) = residuals_of_logs(stage)
     assert any(x.any() for label, (x, _, _) in course.missing.items() if not label.startswith("torque"))
     assert list(stages.refit_all([straight.machine], stage, run_in_turn)) == [None]

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from excite.diagnosis import parallel, run_forked
-from excite.diagnosis.parallel import run_ahead, run_in_turn, usable_cores
+from excite.diagnosis.parallel import run_in_turn, usable_cores
 
 
 def test_answers_come_in_order_and_from_elsewhere() -> None:
@@ -33,25 +33,6 @@ def test_answers_come_in_order_and_from_elsewhere() -> None:
         assert not any(own for _, own in run_forked(calls))
     assert list(run_forked(calls[:1])) == [(0, True)]
     assert list(run_forked([])) == []
-
-
-def test_a_call_is_set_out_upon_before_it_is_asked_for(tmp_path: Path) -> None:
-    """Where there are processes for it; its answer and those after it come as ever, and nothing of it stays behind."""
-
-    def told(k: int) -> int:
-        (tmp_path / str(k)).write_text(f"{os.getpid()}\n")
-        return k
-
-    calls = [partial(told, k) for k in range(3)]
-    here, there = run_ahead(calls, run_in_turn), run_ahead(calls, run_forked)
-    if usable_cores() > 1:
-        assert _pids(tmp_path, 1) != {os.getpid()}
-    assert list(there) == [0, 1, 2]
-    for file in tmp_path.iterdir():
-        file.unlink()
-    assert not list(tmp_path.iterdir())
-    assert list(here) == [0, 1, 2]
-    assert list(run_ahead([], run_forked)) == []
 
 
 def test_arrays_come_whole_and_are_ones_own() -> None:

@@ -150,4 +150,4 @@ def test_friction_near_rest_is_known_at_each_joint_before_effects_are_sought() -
     assert size["quadratic_drag@upper_arm"] == pytest.approx(drag, rel=0.15)
     fitted = dict(zip(found.after.model.base.names, found.after.fit.X, strict=True))
     assert fitted["Fs1"] == pytest.approx(ARM_DRY[0], rel=0.03)
-    assert found.after.fit.cost < 1.05 * found.after.expected_cost
+    assert found.after.fit.cost < 1.05 * found.after.data.n_readings

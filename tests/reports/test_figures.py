@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from types import SimpleNamespace
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
@@ -26,7 +28,6 @@ from excite.reports import (
     diagnosis_figures,
     figures,
     slip_figure,
-    text_faults,
     top_view_figure,
     torque_figures,
     writing_figures,
@@ -289,6 +290,34 @@ KINDS: dict[str, Callable[[Model], Figure]] = {
     "study of verdicts": lambda m: study(m, (60.0,), verdicts=True),
     "curves": lambda m: torque_figures.curves_figure(torques(m), m.machine.title),
 }
+
+
+TOUCH_PX = 1.0  # by which boxes of texts may overlap: letters don't fill theirs
+
+
+def text_faults(figure: Figure) -> Iterator[str]:
+    """Yield each visible text that is cut off or lies on another one."""
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.draw()
+    renderer = canvas.get_renderer()
+    found = figure.findobj(Text)
+    texts = [t for t in found if isinstance(t, Text) and t.get_visible() and t.get_text().strip()]
+    hidden = {id(t) for ax in figure.axes if not (ax.get_visible() and ax.axison) for t in ax.findobj(Text)}
+    for ax in figure.axes:
+        for axis, limits in ((ax.xaxis, ax.get_xlim()), (ax.yaxis, ax.get_ylim())):
+            low, high = sorted(limits)
+            for tick in [*axis.get_major_ticks(), *axis.get_minor_ticks()]:
+                if not low - 1e-9 * abs(low) <= tick.get_loc() <= high + 1e-9 * abs(high):
+                    hidden |= {id(tick.label1), id(tick.label2)}
+    boxes = [(t.get_text(), t.get_window_extent(renderer)) for t in texts if id(t) not in hidden]
+    whole = figure.bbox
+    for text, box in boxes:
+        if box.x0 < whole.x0 - 1 or box.x1 > whole.x1 + 1 or box.y0 < whole.y0 - 1 or box.y1 > whole.y1 + 1:
+            yield f"cut off: {text!r}"
+    for (one, a), (other, b) in itertools.combinations(boxes, 2):
+        wide, high = min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0)
+        if wide > TOUCH_PX and high > TOUCH_PX:
+            yield f"{one!r} lies on {other!r}"
 
 
 WIDTHS_AND_MACHINES = [
