@@ -57,14 +57,14 @@ from excite.workflows import study_plan
 
 T = TypeVar("T")
 INPUTS = {  # mutated inputs: how many in the fast suite (seeds from 1) and in the slow one, whose seeds are from
-    "logs": (60, 3600, 1000),
-    "machine files": (60, 3000, 1000),
-    "profiles": (30, 1200, 1000),
-    "studies": (40, 1500, 1000),
-    "command lines": (40, 700, 1000),
-    "command lines as processes": (0, 60, 50_000),
-    "design folders": (20, 500, 1000),
-    "estimates": (20, 500, 1000),
+    "logs": (60, 1200, 1000),
+    "machine files": (60, 1000, 1000),
+    "profiles": (30, 500, 1000),
+    "studies": (40, 500, 1000),
+    "command lines": (40, 200, 1000),
+    "command lines as processes": (0, 20, 50_000),
+    "design folders": (20, 200, 1000),
+    "estimates": (20, 200, 1000),
 }
 PATIENCE = 120.0  # s for one input, on a machine that is busy
 LONGEST = 800  # characters of a message

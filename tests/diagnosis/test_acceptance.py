@@ -63,18 +63,6 @@ def file_with(tmp_path: Path, text: str) -> Path:
             marks=pytest.mark.slow,
         ),
         pytest.param(
-            '[sensor.thetal]\nlateral = { value = 1.255, source = "measured" }\n',
-            "measuring_wheel_position@measuring_wheel_left",
-            0.005,
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            '[body.rear_roll.contact]\nradius = { value = 0.651, source = "measured" }\n',
-            "contact_radius@rear_roll",
-            0.001,
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
             "".join(
                 f'[body.{roll}.contact]\nradius = {{ value = {radius}, source = "measured" }}\n'
                 for roll, radius in (("front_roll", 0.652), ("rear_roll", 0.652))

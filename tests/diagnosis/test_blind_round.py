@@ -110,7 +110,7 @@ def test_the_program_identifies_the_second_roller(va12: Model) -> None:
 
 @pytest.mark.slow
 def test_intervals_hold_on_the_second_roller(va12: Model) -> None:
-    inside = np.concatenate([np.abs(errors(case("nothing", "", k), va12)) < 1.96 for k in range(6)])
+    inside = np.concatenate([np.abs(errors(case("nothing", "", k), va12)) < 1.96 for k in range(3)])
     assert np.mean(inside) > 0.85
 
 
@@ -303,8 +303,8 @@ def test_of_two_that_nothing_follows_the_stronger_is_named() -> None:
 
 @pytest.mark.slow
 def test_hardly_any_clean_log_is_accused() -> None:
-    told = {k: score(case("nothing", "", k), ask(blind(case("nothing", "", k)).log)).outcome for k in range(4)}
-    assert sum(o != "clean" for o in told.values()) <= 1, told
+    told = {k: score(case("nothing", "", k), ask(blind(case("nothing", "", k)).log)).outcome for k in range(2)}
+    assert set(told.values()) == {"clean"}, told
 
 
 @pytest.mark.slow
