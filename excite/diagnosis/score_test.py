@@ -272,7 +272,7 @@ class _Acting:
     placed: Sequence[PlacedEffect] = field(compare=False)
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=8)
 def _functions(acting: _Acting) -> tuple[SignatureFunctions, BatchedFunction, BatchedFunction]:
     """Build signatures, and the same of forces and of readings for many samples; stages of a search share them."""
     found = signatures(acting.machine, acting.standard, acting.placed)
