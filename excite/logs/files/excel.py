@@ -46,7 +46,7 @@ def read_excel(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     best, most, count = None, -1, len(book.worksheets)
     try:
         for sheet in book.worksheets:
-            table = _sheet(path, sheet)
+            table = _sheet(path, sheet, unpacked)
             if table is None:
                 continue
             has = len(wanted & {*map(str, table.columns), *table.attrs[OTHER_NAMES]})
@@ -62,8 +62,8 @@ def read_excel(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     return best
 
 
-def _sheet(path: Path, sheet: Any) -> pd.DataFrame | None:
-    """Read the table of a sheet, None where there is none."""
+def _sheet(path: Path, sheet: Any, unpacked: int) -> pd.DataFrame | None:
+    """Read the table of a sheet of a workbook of so many unpacked bytes, None where there is none."""
     sheet.reset_dimensions()  # what the file says of them may be anything
     lines = sheet.iter_rows(values_only=True)
     begin = list(itertools.islice(lines, BEGIN))
@@ -72,16 +72,19 @@ def _sheet(path: Path, sheet: Any) -> pd.DataFrame | None:
     if at is None:
         return None
     count = layout.width(at.names)
+    if any(cell is not None for cell in begin[at.header][MOST_COLUMNS:]):
+        raise LogError(f"{path}: sheet {sheet.title}, row {at.header + 1} has more than {MOST_COLUMNS} columns")
     blocks: list[list[pd.Series]] = []
-    rows_read, cells = 0, list[tuple[Any, ...]]()
-    for line in itertools.chain(begin[at.start :], lines, [None]):
+    rows_read, held, cells = 0, 0, list[tuple[Any, ...]]()
+    for line in itertools.chain(sheet.iter_rows(min_row=at.start + 1, max_col=count, values_only=True), [None]):
         if line is not None:
-            cells.append(tuple(line[:count]) + (None,) * (count - len(line)))
+            cells.append(line)
             rows_read += 1
-        if cells and (line is None or len(cells) * count > BLOCK_CELLS):
+            held += count - line.count(None)
+            refuse_huge(path, rows_read, count, unpacked)
+        if cells and (line is None or held > BLOCK_CELLS):
             blocks.append([_column([row[k] for row in cells]) for k in range(count)])
-            cells = []
-            refuse_huge(path, rows_read, count)
+            held, cells = 0, []
         if rows_read > LONGEST:
             raise LogError(f"{path}: sheet {sheet.title} claims more than {LONGEST} rows; the file is damaged")
     columns = [_joined([block[k] for block in blocks]) for k in range(count)]
