@@ -417,7 +417,7 @@ class Day:
                 "--machine",
                 self.machine,
                 "--out",
-                str(self.folder / f"log-{Path(log).stem[:MAX_NAME]}"),
+                str(self.folder / f"log-{Path(log).name[:MAX_NAME]}"),
             ]
         form, out = self.forms[step], ["--out", str(self.out(step))]
         if step == "machine":
