@@ -75,19 +75,24 @@ def _git(place: Path, *arguments: str) -> str:
     ).stdout.strip()
 
 
+def real(path: str | Path) -> Path:
+    """Return the absolute path behind links; of a link that leads to itself its own, where Path.resolve raises."""
+    return Path(os.path.realpath(path))
+
+
 def check_out_folder(out: Path, inputs: Iterable[Path] = (), option: str = "--out") -> None:
     """Check before the work that `out` can be written at its end. Raises FolderError.
 
     An empty folder may be replaced, and a result folder with only the program's own files and none of the `inputs`.
     option: what the user gives the folder by.
     """
-    if out.is_file():
+    if os.path.lexists(out) and not out.is_dir():  # a file, a pipe, a link that leads nowhere or to itself
         raise FolderError(f"{out}: is a file, give a folder")
-    place = out.resolve()
+    place = real(out)
     if place == Path.cwd() or place in Path.cwd().parents:
         raise FolderError(f"{out}: is the current folder or one above it, choose another {option}")
     for path in inputs:
-        if place == path.resolve() or place in path.resolve().parents:
+        if place == real(path) or place in real(path).parents:
             raise FolderError(f"{out}: contains the input {path}, choose another {option}")
     if out.is_dir():
         foreign = [p.name for p in out.iterdir() if not OWN_NAMES.fullmatch(p.name)]

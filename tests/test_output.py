@@ -162,3 +162,10 @@ def _write_with_a_limit(out: Path) -> None:
             part.write_bytes(bytes(200_000))
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("target", ["out", "nowhere"])
+def test_a_link_that_leads_nowhere_is_no_folder(target: str, tmp_path: Path) -> None:
+    (tmp_path / "out").symlink_to(target)
+    with pytest.raises(FolderError, match="out: is a file"):
+        output.check_out_folder(tmp_path / "out")

@@ -279,8 +279,8 @@ class Day:
             if step == "drive" and (design := self.design()) and _same(r.summary["design"], design.folder):
                 return r
             if step in ("identify", "diagnose") and self._is_machine(r.summary["machine"]):
-                used = {Path(log.partition(" from row ")[0]).resolve() for log in r.summary["logs"]}
-                if used == {Path(log).resolve() for log in self.logs}:
+                used = {output.real(log.partition(" from row ")[0]) for log in r.summary["logs"]}
+                if used == {output.real(log) for log in self.logs}:
                     return r
         return None
 
@@ -417,7 +417,7 @@ class Day:
                 "--machine",
                 self.machine,
                 "--out",
-                str(self.folder / f"log-{Path(log).stem[:MAX_NAME]}"),
+                str(self.folder / f"log-{Path(log).name[:MAX_NAME]}"),
             ]
         form, out = self.forms[step], ["--out", str(self.out(step))]
         if step == "machine":
@@ -487,4 +487,4 @@ def _alike(usual: Any, kept: Any) -> bool:
 
 
 def _same(one: str | Path, other: str | Path) -> bool:
-    return Path(one).resolve() == Path(other).resolve()
+    return output.real(one) == output.real(other)

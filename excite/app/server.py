@@ -104,9 +104,9 @@ def web_app(day: Day) -> Any:
     @web.get("/files/{path:path}")
     def file(path: str) -> Any:
         try:
-            found = (day.folder / path).resolve()
-            there = found.is_relative_to(day.folder.resolve()) and found.is_file()
-        except (OSError, ValueError):  # a name that no file can have, a loop of links
+            found = output.real(day.folder / path)
+            there = found.is_relative_to(output.real(day.folder)) and found.is_file()
+        except (OSError, ValueError):  # a name that no file can have
             there = False
         if not there:
             return PlainTextResponse("no such file\n", 404)
@@ -116,7 +116,8 @@ def web_app(day: Day) -> Any:
     async def log(request: Any) -> Any:
         name = Path(request.path_params["name"].replace("\\", "/")).name
         path = day.folder / name
-        if path.suffix.lower() not in SUFFIXES or name.startswith(".") or not is_possible_name(name):
+        possible = is_possible_name(name) and name.isprintable() and not name.startswith(".")
+        if path.suffix.lower() not in SUFFIXES or not possible:
             said = f"{name[:60]}: is no name for a log, which ends in {ENDINGS}"
             return PlainTextResponse(said, 400)
         taken = f"{path}: exists already; rename the log, or choose it in the list"
@@ -207,7 +208,7 @@ def serve(folder: Path, port: int, browser: bool, ready: Callable[[str], None]) 
     ready(address)
     door = _redirect(folder, address) if browser else None
     if door is not None:
-        threading.Timer(0.5, webbrowser.open, (door.resolve().as_uri(),)).start()
+        threading.Timer(0.5, webbrowser.open, (output.real(door).as_uri(),)).start()
     try:
         asyncio.run(uvicorn.Server(settings).serve([taken]))
     except KeyboardInterrupt:

@@ -459,7 +459,7 @@ def simulate(
     workflows.require_known("--friction", friction, simulation.FRICTION_LAWS)
     workflows.require_known("--out: ending", out.suffix.lower(), tuple(TABLE_WRITERS))
     model = workflows.build_model(machine)
-    if out.resolve() in [path.resolve() for path in (drive_file(profile), *machine_file(machine))]:
+    if output.real(out) in map(output.real, (drive_file(profile), *machine_file(machine))):
         raise UsageError(f"--out {out}: is what the log is made from, choose another file")
     planned = read_drive(profile, model)
     nominal, model = model, workflows.with_effects(model, effect or (), len(planned.torque))

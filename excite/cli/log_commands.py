@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from excite import workflows
+from excite import output, workflows
 from excite.cli import options, terminal
 from excite.cli.application import TABLE_WRITERS, machine_file, result_folder, write_check
 from excite.cli.options import (
@@ -290,7 +290,6 @@ def convert_log(
 
     Example: excite log convert log.mf4 --machine va12 --out log.parquet
     """
-    from excite import output
     from excite.logs import convert
 
     workflows.require_known("--out: ending", out.suffix.lower(), tuple(TABLE_WRITERS))
@@ -298,7 +297,7 @@ def convert_log(
     tables, rate, notes = convert(model, path, si)
     numbered = [out.with_name(f"{out.stem}-{k + 1}{out.suffix}") for k in range(len(tables))]
     paths = [out] if len(tables) == 1 else numbered
-    if {p.resolve() for p in paths} & {path.resolve(), *(p.resolve() for p in machine_file(machine))}:
+    if {*map(output.real, paths)} & {output.real(path), *map(output.real, machine_file(machine))}:
         raise UsageError(f"--out {out}: is what the log is made from, choose another file")
     for table, file in zip(tables, paths, strict=True):
         with output.new_file(file) as part:
@@ -324,5 +323,5 @@ def _check_logs_and_filter(logs: Sequence[Path], filtering: str) -> None:
     from excite.identification import FILTERS
 
     workflows.require_known("--filter", filtering, tuple(FILTERS))
-    if len({path.resolve() for path in logs}) < len(logs):
+    if len({*map(output.real, logs)}) < len(logs):
         raise UsageError("LOG: the same file is given twice, which would count it twice")

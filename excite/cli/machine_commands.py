@@ -135,7 +135,7 @@ def write_urdf(
     """
     from excite import output
 
-    if out.resolve() == origin.resolve():
+    if output.real(out) == output.real(origin):
         raise UsageError(f"--out {out}: is what the robot is read from, choose another file")
     saved = _read_usable_estimate(result)
     text, notes = workflows.urdf_with_estimate(origin, saved.model, saved.estimate)

@@ -28,7 +28,7 @@ from excite.text import format_number
 
 RATIOS_NOTE = (
     "no torque constant is given, so every value is divided by that constant, the torque or force per {} before the"
-    " gear, the same for all drives; give torque_constant to get SI values, or call a load known to get that constant"
+    " gear, the same for all drives; give torque_constant to get SI values"
 )
 
 
@@ -93,6 +93,8 @@ def identify(
                 f"{repaired[0].source}: every torque is zero all along: are their sensors connected? Without a drive"
                 " logs tell ratios only: call one value of the machine file known, other than zero, to get all others"
             )
+        if model.machine.in_ratios:
+            model = _as_large_as_logged(model, repaired, filter)
         try:
             chosen = METHODS[method]
             otherwise = _refuse if explained and chosen.exact else chosen.otherwise or chosen.find
@@ -111,9 +113,21 @@ def identify(
     if estimate.share_outside_law is None:
         estimate = replace(estimate, share_outside_law=_share_outside_law(model, repaired, filter, estimate))
     ratios = (RATIOS_NOTE.format(model.machine.torque_unit),) if model.machine.in_ratios else ()
+    if ratios and not model.calibration:
+        ratios = (f"{ratios[0]}, or call a load known to get that constant",)
     unused = unused_sensors(model, method, repaired)
     said = [f"{method} does not use {', '.join(unused)}"] if unused else []
     return add_notes(estimate, *ratios, *said, *(note for e in examined for note in e.notes), *doubts)
+
+
+def _as_large_as_logged(model: Model, logs: Sequence[Log], filter: Filter) -> Model:
+    """Divide the machine file's values [SI] by the constant that makes their torques as large as those of the logs."""
+    rows = filtered_blocks(model, logs, filter)
+    logged, predicted = (
+        np.linalg.norm(np.hstack(x)) for x in ([Y for _, Y in rows], [W @ model.nominal for W, _ in rows])
+    )
+    factor = logged / predicted if logged and predicted else 1.0
+    return replace(model, nominal=factor * model.nominal, scale=factor * model.scale)
 
 
 def corrected_logs(model: Model, logs: Sequence[Log], method: str, filter: Filter) -> list[Log]:

@@ -12,6 +12,7 @@ import scipy
 from excite.errors import NotConsistentError
 from excite.identification.estimate import Estimate, add_notes
 from excite.identification.fit_tests import describe_failures
+from excite.identification.torque_constant import torque_constant
 from excite.logs import Log, samples, stretches
 from excite.model import Model, required_signs
 from excite.model.machine import Filter
@@ -137,6 +138,11 @@ def _contradiction(model: Model, estimate: Estimate) -> str:
     The misfit of the known values has the covariance I - A C A' after the logs, with C the covariance of the estimate
     (chi-squared test).
     """
+    if (constant := torque_constant(model, estimate)) is not None and constant.p_value < CONTRADICTION_LEVEL:
+        return (
+            f"what the machine file calls known ({', '.join(constant.known)}) disagrees on the torque constant (p-value"
+            f" {format_p_value(constant.p_value)}): check these values"
+        )
     known = model.known
     if not known or not np.isfinite(estimate.value[np.any(known.rows != 0, axis=0)]).all():
         return ""

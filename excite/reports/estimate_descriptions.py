@@ -21,12 +21,11 @@ from excite.reports.description import (
     meaning_index,
 )
 from excite.smoothing import MAX_IDENTIFIABLE_STD
-from excite.text import count, format_number, format_p_value, format_percent, format_rounded, format_uncertain
+from excite.text import count, format_number, format_percent, format_rounded, format_uncertain
 
 MISFIT_OF_REPEATS = 2.0  # error over repeatability, from which something remains; chosen
 FALSE_ALARM = 0.01  # probability of a verdict against intervals that hold; chosen
 MOVED_LEVEL = 1e-3  # p-value below which more than a payload changed between two estimates; chosen
-DISAGREE = 0.01  # p-value below which known values are said to disagree
 
 
 def describe_verify(s: Summary) -> Description:
@@ -212,13 +211,12 @@ def _describe_reasons(reasons: Mapping[str, str]) -> list[str]:
 
 
 def _describe_constant(c: Mapping[str, Any]) -> str:
-    """Say what the torque constant is, from which known quantities, and whether these agree."""
-    apart = c["p_value"] is not None and c["p_value"] < DISAGREE
+    """Say what the torque constant is, and from which known quantities."""
     return (
         f"Torque constant of the motors: {format_uncertain(c['value'], c['std'], c['unit'])} (95 %:"
         f" {format_number(c['low95'], 4)} to {format_number(c['high95'], 4)}), from {', '.join(c['known'])}; multiply a"
         " value by it to get it in SI units."
-    ) + (f" The known values disagree on it (p-value {format_p_value(c['p_value'])})." if apart else "")
+    )
 
 
 def _prediction_error(s: Summary) -> str:

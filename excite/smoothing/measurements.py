@@ -156,7 +156,10 @@ def prepare_measurements(space: StateSpace, log: Log, unbiased: bool = False) ->
     torque_noise = np.array(
         [
             np.sqrt(k)
-            * max(log.noise.get(s.name) or white_noise(log.readings(s.name)), 1e-3 * (noise_of(model.machine, s) or 1))
+            * max(
+                log.noise.get(s.name) or white_noise(log.readings(s.name)),
+                1e-3 * (noise_of(model.machine, s) or min(np.ptp(log.readings(s.name)), 1) or 1),
+            )
             for k, s in zip(rows_per_reading, torques, strict=True)
         ]
     )

@@ -19,6 +19,7 @@ from scipy.optimize import minimize
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
+from excite import output
 from excite.errors import UsageError
 from excite.workflows.urdf import read_robot
 
@@ -273,9 +274,9 @@ def _mesh_file(path: Path, name: str) -> Path:
     if name.startswith("package://"):
         inner = Path(name.removeprefix("package://"))
         tails = [inner, Path(*inner.parts[1:])]
-        places = [folder / tail for folder in path.resolve().parents for tail in tails]
+        places = [folder / tail for folder in output.real(path).parents for tail in tails]
     else:
-        places = [path.resolve().parent / plain]
+        places = [output.real(path).parent / plain]
     for place in places:
         if place.is_file():
             return place

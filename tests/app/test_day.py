@@ -209,6 +209,13 @@ def test_result_of_other_logs_is_not_shown(log: Path, tmp_path: Path) -> None:
     assert np.isfinite(day.result_of("identify").time)  # type: ignore[union-attr]
 
 
+def test_logs_of_one_stem_have_a_check_each(tmp_path: Path) -> None:
+    day = Day(tmp_path)
+    day.machine = "va12"
+    places = {day.command("log", str(tmp_path / name))[-1] for name in ("day.csv", "day.mat")}
+    assert len(places) == 2
+
+
 def test_the_window_lists_a_log_of_every_format_that_is_read(tmp_path: Path) -> None:
     every = sorted(str(tmp_path / f"log{ending}") for ending in SUFFIXES)
     for path in every:

@@ -47,6 +47,7 @@ def folder(place: Path) -> Path:
     os.mkfifo(results / "fifo.csv")
     os.mkfifo(results / "fifo.toml")
     (results / "folder.csv").mkdir()
+    (results / "loop.csv").symlink_to("loop.csv")
     foreign = {"machine": ["x"], "logs": ["a\0", "b" * 5000], "forms": [], "accepted": 3}
     (results / "app.json").write_text(json.dumps(foreign))
     return results
@@ -86,9 +87,9 @@ def test_the_server_never_answers_500(tmp_path: Path) -> None:
         code, page = request(address, "GET", "")
         assert code == 200
         assert "it is not shown" in page
-        for odd in ("a" * 5000, "a%00b", "fifo.csv", "pipe/summary.json", "%ff%fe", "a/" * 2000):
+        for odd in ("a" * 5000, "a%00b", "fifo.csv", "loop.csv", "pipe/summary.json", "%ff%fe", "a/" * 2000):
             assert request(address, "GET", f"files/{odd}")[0] in (404, 414), odd
-        for odd in ("a" * 5000 + ".csv", "a%00b.csv", "x.exe", "x", ".csv", "machine.toml", "x.TOML"):
+        for odd in ("a" * 5000 + ".csv", "a%00b.csv", "a%0ab.csv", "x.exe", "x", ".csv", "machine.toml", "x.TOML"):
             code, said = request(address, "POST", f"log/{odd}", b"t_s\n0\n")
             assert code in (400, 404, 414), (odd, code, said)
         assert request(address, "POST", "log/fifo.csv", b"x")[0] == 409

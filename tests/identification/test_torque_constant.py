@@ -106,6 +106,28 @@ def test_a_known_load_gives_the_torque_constant(unit: str, scale: float, gear: f
     assert friction == pytest.approx(0.05, rel=0.2)
 
 
+@pytest.mark.parametrize("constant", [1000.0, 0.001])
+def test_an_estimate_has_no_preferred_size_of_the_torque_constant(constant: float, tmp_path: Path) -> None:
+    model = build(load_machine(servo(tmp_path, "V")))
+    swing(constant).to_csv(tmp_path / "log.csv", index=False)
+    estimate = identify(model, [read_log(tmp_path / "log.csv", model.machine)], "inverse")
+    assert estimate.status == "valid", estimate.doubt
+    found = torque_constant(model, estimate)
+    assert found is not None
+    assert found.value == pytest.approx(constant, rel=0.01)
+
+
+def test_known_values_that_disagree_on_the_constant_leave_it_doubtful(tmp_path: Path) -> None:
+    file = servo(tmp_path, "V")
+    file.write_text(file.read_text().replace(f"ZZ = {q(0.002)}", f"ZZ = {q(0.02, ', known = true')}"))
+    model = build(load_machine(file))
+    swing(0.465).to_csv(tmp_path / "log.csv", index=False)
+    estimate = identify(model, [read_log(tmp_path / "log.csv", model.machine)], "inverse")
+    assert estimate.status == "doubtful"
+    assert "disagrees on the torque constant" in estimate.doubt
+    assert not any("call a load known" in note for note in estimate.notes)
+
+
 def test_nothing_known_gives_no_constant(tmp_path: Path) -> None:
     model = build(load_machine(servo(tmp_path, "V", known="")))
     log = tmp_path / "log.csv"

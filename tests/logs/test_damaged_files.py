@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -78,6 +79,31 @@ def test_a_row_with_a_huge_number_is_refused(child: damage.Child, tmp_path: Path
     answer = child.read(path)
     assert answer.kind == "refused"
     assert "claims more than 1048576 rows" in answer.what
+
+
+@pytest.mark.parametrize(
+    ("last", "named", "filled", "rows", "what"),
+    [
+        ("XFD", False, True, 20_000, ""),  # the last column of a sheet holds numbers that have no name
+        ("XFD", True, True, 100, "row 1 has more than 10000 columns"),
+        ("NTP", True, False, 20_000, "claims 2001 rows of 10000 columns, more numbers than its bytes hold"),
+    ],
+)
+def test_far_cells_of_a_sheet_cost_no_more_than_near_ones(
+    last: str, named: bool, filled: bool, rows: int, what: str, child: damage.Child, tmp_path: Path
+) -> None:
+    path, text = tmp_path / "log.xlsx", '<c r="{}" t="str"><v>{}</v></c>'
+    log_files.write_table(log_files.small_table(), path)
+    header = [text.format(f"{name}1", name) for name in ("A", "B", *([last] if named else []))]
+    lines = [f'<row r="1">{"".join(header)}</row>']
+    for r in range(2, rows + 2):
+        lines.append(f'<row r="{r}"><c r="A{r}"><v>{r}</v></c><c r="B{r}"><v>1</v></c>')
+        lines[-1] += f'<c r="{last}{r}"><v>3</v></c></row>' if filled or r < 10 else "</row>"
+    body = f"<sheetData>{''.join(lines)}</sheetData>".encode()
+    path.write_bytes(damage.in_zip(path.read_bytes(), lambda xml: re.sub(b"<sheetData>.*</sheetData>", body, xml)))
+    answer = child.read(path)
+    assert answer.kind == ("refused" if what else "table")
+    assert what in answer.what
 
 
 def test_a_container_that_unpacks_to_very_much_is_refused(child: damage.Child, tmp_path: Path) -> None:

@@ -686,6 +686,9 @@ def test_a_machine_is_also_built_from_data() -> None:
     ("change", "words"),
     [
         (lambda text: "".join(f"k{k} = 1\n" for k in range(60_000)) + text, "holds more than 50000 keys"),
+        (lambda text: f"{'a.' * 20_000}a = 1\n" + text, "nested too deeply"),
+        (lambda text: f"{text}\n[{'a.' * 20_000}a]\n", "nested too deeply"),
+        (lambda text: f"x = {{ {'a.' * 20_000}a = 1 }}\n" + text, "nested too deeply"),
         (lambda text: "".join(f"k{k} = 1\n" for k in range(500)) + text, r"no such key here.*\(and 499 more\)"),
         (lambda text: text + "\nreference_number = " + "9" * 5000, "holds an integer of thousands of digits"),
         (lambda text: text + "\nreference_number = 0x" + "f" * 5000, "holds an integer of 20000 bits"),

@@ -101,13 +101,16 @@ def _ignore(_: object) -> None:
     """Say nothing of an error in a destructor."""
 
 
-def refuse_huge(path: Path, rows: int, columns: int) -> None:
-    """Raises LogError where a file claims more than fits into memory, or far more than its bytes can hold."""
+def refuse_huge(path: Path, rows: int, columns: int, unpacked: int | None = None) -> None:
+    """Raises LogError where a file claims more than fits into memory, or far more than its bytes can hold.
+
+    unpacked: bytes that these are, where the file says so.
+    """
     cells = rows * max(columns, 1)
-    if cells > MOST_CELLS or (cells > UNASKED_CELLS and 8 * cells > MOST_PACKED * _size(path)):
+    if cells > MOST_CELLS or (cells > UNASKED_CELLS and 8 * cells > (unpacked or MOST_PACKED * _size(path))):
         raise LogError(
-            f"{path}: claims {count(rows, 'row')} of {count(columns, 'column')}, more than the {MOST_CELLS} numbers"
-            " that are read; is the file damaged? otherwise cut it into shorter logs"
+            f"{path}: claims {count(rows, 'row')} of {count(columns, 'column')}, more numbers than its bytes hold, or"
+            f" than the {MOST_CELLS} that are read; is the file damaged? otherwise cut it into shorter logs"
         )
 
 

@@ -12,19 +12,7 @@ import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
-from excite.logs.files import layout
-from excite.logs.files.common import (
-    MOST_BYTES,
-    MOST_COLUMNS,
-    NOTES,
-    OTHER_NAMES,
-    UNITS_SAID,
-    UNITS_UNKNOWN,
-    name_the_same,
-    numbered,
-    refuse_huge,
-    vectors_apart,
-)
+from excite.logs.files import common, layout
 
 BEGIN = 200  # rows in which the header is looked for; chosen
 LONGEST = 1_048_576  # rows of a sheet: Excel's own limit
@@ -40,19 +28,19 @@ def read_excel(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
 
     with zipfile.ZipFile(path) as packed:
         unpacked = sum(item.file_size for item in packed.infolist())
-    if unpacked > max(UNASKED_BYTES, min(MOST_TIMES * path.stat().st_size, MOST_BYTES)):
+    if unpacked > max(UNASKED_BYTES, min(MOST_TIMES * path.stat().st_size, common.MOST_BYTES)):
         raise LogError(f"{path}: unpacks to {unpacked // 10**6} MB, more than is read; save it as CSV in shorter logs")
     book = openpyxl.load_workbook(path, read_only=True, data_only=True)
     best, most, count = None, -1, len(book.worksheets)
     try:
         for sheet in book.worksheets:
-            table = _sheet(path, sheet)
+            table = _sheet(path, sheet, unpacked)
             if table is None:
                 continue
-            has = len(wanted & {*map(str, table.columns), *table.attrs[OTHER_NAMES]})
+            has = len(wanted & {*map(str, table.columns), *table.attrs[common.OTHER_NAMES]})
             if has > most:
                 best, most = table, has
-                best.attrs[NOTES] += [f"read from sheet {sheet.title}"] if count > 1 else []
+                best.attrs[common.NOTES] += [f"read from sheet {sheet.title}"] if count > 1 else []
             if has == len(wanted):
                 break
     finally:
@@ -62,41 +50,44 @@ def read_excel(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     return best
 
 
-def _sheet(path: Path, sheet: Any) -> pd.DataFrame | None:
-    """Read the table of a sheet, None where there is none."""
+def _sheet(path: Path, sheet: Any, unpacked: int) -> pd.DataFrame | None:
+    """Read the table of a sheet of a workbook of so many unpacked bytes, None where there is none."""
     sheet.reset_dimensions()  # what the file says of them may be anything
     lines = sheet.iter_rows(values_only=True)
     begin = list(itertools.islice(lines, BEGIN))
-    rows = [["" if cell is None else str(cell) for cell in line[:MOST_COLUMNS]] for line in begin]
+    rows = [["" if cell is None else str(cell) for cell in line[: common.MOST_COLUMNS]] for line in begin]
     at = layout.search([[*cells[: layout.width(cells)], ""] for cells in rows])
     if at is None:
         return None
     count = layout.width(at.names)
+    if any(cell is not None for cell in begin[at.header][common.MOST_COLUMNS :]):
+        raise LogError(f"{path}: sheet {sheet.title}, row {at.header + 1} has more than {common.MOST_COLUMNS} columns")
     blocks: list[list[pd.Series]] = []
-    rows_read, cells = 0, list[tuple[Any, ...]]()
-    for line in itertools.chain(begin[at.start :], lines, [None]):
+    rows_read, held, cells = 0, 0, list[tuple[Any, ...]]()
+    for line in itertools.chain(sheet.iter_rows(min_row=at.start + 1, max_col=count, values_only=True), [None]):
         if line is not None:
-            cells.append(tuple(line[:count]) + (None,) * (count - len(line)))
+            cells.append(line)
             rows_read += 1
-        if cells and (line is None or len(cells) * count > BLOCK_CELLS):
+            held += count - line.count(None)
+            common.refuse_huge(path, rows_read, count, unpacked)
+        if cells and (line is None or held > BLOCK_CELLS):
             blocks.append([_column([row[k] for row in cells]) for k in range(count)])
-            cells = []
-            refuse_huge(path, rows_read, count)
+            held, cells = 0, []
         if rows_read > LONGEST:
             raise LogError(f"{path}: sheet {sheet.title} claims more than {LONGEST} rows; the file is damaged")
     columns = [_joined([block[k] for block in blocks]) for k in range(count)]
     last = max((int(np.flatnonzero(c.notna())[-1]) for c in columns if c.notna().any()), default=-1)
     columns = [c.iloc[: last + 1] for c in columns]
     names = at.names[:count]
-    called = numbered(names)
+    called = common.numbered(names)
     table = pd.DataFrame({called[k]: columns[k] for k, name in enumerate(names) if name})
-    table = vectors_apart(table)
+    table = common.vectors_apart(table)
     table.attrs |= {
-        NOTES: name_the_same(names, f"sheet {sheet.title}, row {at.header + 1}")
+        common.NOTES: common.name_the_same(names, f"sheet {sheet.title}, row {at.header + 1}")
         + layout.left_out([cells if any(map(str.strip, cells)) else [] for cells in rows], at),
-        UNITS_UNKNOWN: layout.unknown_units(names),
-        UNITS_SAID: layout.bracketed_units(names) | at.units,
-        OTHER_NAMES: layout.without_units(names) | at.other,
+        common.UNITS_UNKNOWN: layout.unknown_units(names),
+        common.UNITS_SAID: layout.bracketed_units(names) | at.units,
+        common.OTHER_NAMES: layout.without_units(names) | at.other,
     }
     return table
 

@@ -11,15 +11,7 @@ import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
-from excite.logs.files.common import (
-    TIMESTAMPS,
-    UNITS_SAID,
-    columns_of_array,
-    merged,
-    refuse_huge,
-    refuse_swollen,
-    unique_name,
-)
+from excite.logs.files import common
 
 VIRTUAL = (3, 6)  # types of channels that have no bytes
 DEFLATED = (1, 2)  # types of blocks
@@ -34,26 +26,26 @@ def read_mdf(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
 
     groups: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
     units: dict[str, str] = {}
-    taken = {TIMESTAMPS}
+    taken = {common.TIMESTAMPS}
     with MDF(path) as mdf:
         sizes = [(int(g.channel_group.cycles_nr), getattr(g.channel_group, "samples_byte_nr", 0)) for g in mdf.groups]
-        refuse_swollen(path, sum(rows * int(size or 0) for rows, size in sizes))
-        refuse_huge(path, max((rows for rows, _ in sizes), default=0), 1)
+        common.refuse_swollen(path, sum(rows * int(size or 0) for rows, size in sizes))
+        common.refuse_huge(path, max((rows for rows, _ in sizes), default=0), 1)
         _refuse_outside(path, mdf)
         _refuse_other_sizes(path, mdf)
         for index, group in mdf.virtual_groups.items():
             entries = [(None, g, c) for g, found in mdf.included_channels(index)[index].items() for c in found]
             if group.cycles_nr == 0 or not entries:
                 continue
-            refuse_huge(path, int(group.cycles_nr), len(entries))
+            common.refuse_huge(path, int(group.cycles_nr), len(entries))
             for signal in mdf.select(entries, raw=True, copy_master=False, validate=False):
                 if signal.conversion:
                     signal.samples = signal.conversion.convert(signal.samples, ignore_value2text_conversions=True)
                     signal.conversion = None
-                name = unique_name(signal.name, taken)
+                name = common.unique_name(signal.name, taken)
                 taken.add(name)
                 valid = signal.validate(copy=False)
-                columns = columns_of_array(name, _native(valid.samples))
+                columns = common.columns_of_array(name, _native(valid.samples))
                 if not columns or not len(valid):
                     continue
                 groups.append((_native(valid.timestamps).astype(float), columns))
@@ -62,8 +54,8 @@ def read_mdf(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     if not groups:
         raise LogError(f"{path}: no channel with numbers")
     first = min(float(t[0]) for t, _ in groups)
-    table = merged(path, [(t - first, columns) for t, columns in groups])
-    table.attrs[UNITS_SAID] = units
+    table = common.merged(path, [(t - first, columns) for t, columns in groups])
+    table.attrs[common.UNITS_SAID] = units
     return table
 
 
@@ -93,7 +85,7 @@ def _refuse_other_sizes(path: Path, mdf: Any) -> None:
                 for part in (block, getattr(block, "invalidation_block", None)):
                     if part is None or not part.block_type or not part.original_size:
                         continue
-                    refuse_swollen(path, part.original_size)
+                    common.refuse_swollen(path, part.original_size)
                     file.seek(part.address)
                     packed = file.read(part.compressed_size)
                     if part.block_type in DEFLATED:  # a bounded size: it may be a small block of a billion zeros

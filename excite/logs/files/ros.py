@@ -12,14 +12,7 @@ import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
-from excite.logs.files.common import (
-    MOST_ELEMENTS,
-    NOTES,
-    OTHER_NAMES,
-    Rows,
-    merged,
-    said,
-)
+from excite.logs.files import common
 
 STAMP = "header.stamp"  # time column that stands for the stamp in each message's own header
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -90,7 +83,7 @@ def read_mcap(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
             except (McapError, EOFError) as err:
                 if whole:
                     raise
-                notes.append(f"the file breaks off ({said(err)}); read up to there")
+                notes.append(f"the file breaks off ({common.said(err)}); read up to there")
 
         return _table(path, messages(), wanted, unknown, notes)
 
@@ -116,7 +109,7 @@ class _Topic:
     """
 
     def __init__(self, path: Path) -> None:
-        self.times, self.rows = array("q"), Rows(path)
+        self.times, self.rows = array("q"), common.Rows(path)
         self.elements: dict[str, str] = {}
         self.moved = False
 
@@ -176,12 +169,12 @@ def _table(
         groups.append((t, columns))
     if not groups:
         raise LogError(f"{path}: no message has a stamp in a header; write another time_column")
-    table = merged(path, groups)
-    notes = [*table.attrs.get(NOTES, []), *notes]
+    table = common.merged(path, groups)
+    notes = [*table.attrs.get(common.NOTES, []), *notes]
     if STAMP in wanted:
         table.insert(0, STAMP, table.iloc[:, 0])
     kept = {name: column for name, column in other.items() if column in table.columns and name not in table.columns}
-    table.attrs |= {NOTES: notes, OTHER_NAMES: kept}
+    table.attrs |= {common.NOTES: notes, common.OTHER_NAMES: kept}
     return table
 
 
@@ -210,7 +203,7 @@ def _collect(
     if isinstance(value, bool | int | float | np.number | np.bool_):
         row[name] = float(value)
     elif isinstance(value, np.ndarray | list | tuple):
-        if len(value) <= MOST_ELEMENTS and depth < DEEPEST:
+        if len(value) <= common.MOST_ELEMENTS and depth < DEEPEST:
             for k, one in enumerate(value):
                 place = own = f"{name}[{k}]"
                 if len(names) == len(value):
@@ -233,7 +226,7 @@ def _collect(
 
 def _names(value: Any) -> tuple[str, ...]:
     """Return the names of elements that a field holds, () where it holds none that differ."""
-    if not isinstance(value, list | tuple) or len(value) > MOST_ELEMENTS:
+    if not isinstance(value, list | tuple) or len(value) > common.MOST_ELEMENTS:
         return ()
     names = tuple(n for n in value if isinstance(n, str) and n)
     return names if len(set(names)) == len(value) else ()

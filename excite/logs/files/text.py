@@ -14,19 +14,7 @@ import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
-from excite.logs.files import layout
-from excite.logs.files.common import (
-    MOST_BYTES,
-    MOST_COLUMNS,
-    NOTES,
-    OTHER_NAMES,
-    UNCLEAR,
-    UNITS_SAID,
-    UNITS_UNKNOWN,
-    name_the_same,
-    numbered,
-    vectors_apart,
-)
+from excite.logs.files import common, layout
 from excite.logs.files.layout import COMMA, Layout, is_data, is_numeric, is_words
 from excite.logs.files.scopes import read_scope
 
@@ -78,7 +66,7 @@ def read_text(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     twice = [name for name, times in Counter(found.names).items() if times > 1]
     names: list[str] | None = None
     if comment or twice or separator == BLANKS:
-        names = numbered(found.names)
+        names = common.numbered(found.names)
         body = raw[_offset(raw, found.start) :]
         if separator == BLANKS and _has_date_and_clock(body, len(names)):
             body = re.sub(rb"(?m)^([ \t]*\S+)[ \t]+", rb"\1T", body)
@@ -102,25 +90,25 @@ def read_text(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     if unnamed:  # a separator at the end of each line
         table = table.drop(columns=table.columns[unnamed])
     for name in filter(None, twice):
-        same = [n for n, own in zip(numbered(found.names), found.names, strict=True) if own == name]
+        same = [n for n, own in zip(common.numbered(found.names), found.names, strict=True) if own == name]
         if all(table[same[0]].equals(table[n]) for n in same[1:]):
             notes.append(f"column {name} is there {len(same)} times with equal cells; one is kept")
             table = table.drop(columns=same[1:])
         else:
-            notes += name_the_same([n for n in found.names if n == name], f"line {found.header + 1}")
+            notes += common.name_the_same([n for n in found.names if n == name], f"line {found.header + 1}")
     unclear: dict[str, str] = {}
     for name in [n for n in table.columns if table[n].dtype.kind not in "biuf"]:
         if comma:
             table[name], unclear[name] = _without_commas(table[name], comma)
         table[name] = _dates(table[name])
-    table = vectors_apart(table)
+    table = common.vectors_apart(table)
     other = layout.without_units(found.names) | found.other
     table.attrs |= {
-        UNITS_UNKNOWN: layout.unknown_units(found.names),
-        UNITS_SAID: layout.bracketed_units(found.names) | found.units,
-        UNCLEAR: unclear,
-        OTHER_NAMES: other,
-        NOTES: notes,
+        common.UNITS_UNKNOWN: layout.unknown_units(found.names),
+        common.UNITS_SAID: layout.bracketed_units(found.names) | found.units,
+        common.UNCLEAR: unclear,
+        common.OTHER_NAMES: other,
+        common.NOTES: notes,
     }
     return table
 
@@ -171,7 +159,7 @@ def _unpacked(path: Path, notes: list[str]) -> bytes:
                     raise LogError(f"{path}: not a gzip file that can be read: {err}") from None
                 parts.append(part)
                 size += len(part)
-                if size > max(UNASKED_BYTES, min(MOST_TIMES * path.stat().st_size, MOST_BYTES)):
+                if size > max(UNASKED_BYTES, min(MOST_TIMES * path.stat().st_size, common.MOST_BYTES)):
                     raise LogError(f"{path}: unpacks to more than {size // 10**6} MB; cut it into shorter logs")
                 piece = unpack.unconsumed_tail
                 if unpack.eof:
@@ -246,8 +234,8 @@ def _layout(path: Path, lines: list[str]) -> tuple[Layout, str]:
         raise LogError(f"{path}: the file is empty, there is no header with the names of columns")
     separator = BLANKS if _blanks_between(lines, head) else _separator(lines[head])
     header = [name.strip() for name in _row(path, lines, head, separator)]
-    if len(header) > MOST_COLUMNS:
-        raise LogError(f"{path}: not a table: line {head + 1} has {len(header)} cells, more than {MOST_COLUMNS}")
+    if len(header) > common.MOST_COLUMNS:
+        raise LogError(f"{path}: not a table: line {head + 1} has {len(header)} cells, more than {common.MOST_COLUMNS}")
     below = [k for k in range(head + 1, min(len(lines), head + 1 + SEEN)) if lines[k].strip()]
     rows = {k: _row(path, lines, k, separator) for k in below}
     plain = [rows[k] for k in below if not lines[k].lstrip().startswith(COMMENTS)]
@@ -292,7 +280,7 @@ def _searched(lines: list[str]) -> tuple[Layout, str] | None:
             rows = [_split(line, separator) for line in plain]
         except csv.Error:
             continue
-        if max(map(len, rows)) > MOST_COLUMNS:
+        if max(map(len, rows)) > common.MOST_COLUMNS:
             continue
         found = layout.search(rows, comments)
         if found is None or len(found.names) < 2 or max(map(len, found.names)) > LONGEST:
