@@ -26,8 +26,7 @@ from excite.diagnosis.score_test import (
     SignatureColumns,
     renumber_columns,
 )
-from excite.model.effects import PlacedEffect, Site
-from excite.model.machine import Machine
+from excite.model.effects import Site
 from excite.smoothing import SIZE_SCATTER, Fit, UnknownForces, sizes_step
 
 AMOUNT_STD = 2.0  # prior standard deviation of an amount, over its typical size
@@ -75,20 +74,6 @@ class Form:
         right_side = self.right_side[keep] - self.information[np.ix_(keep, np.asarray(at))] @ value
         return replace(
             self, information=self.information[np.ix_(keep, keep)], right_side=right_side, outer=self.outer - len(at)
-        )
-
-    def with_parameter(self, k: int, step: float, x: Candidate, amount_std: float) -> Form:
-        """Return the form with parameter k as a further candidate; step: of the scaled parameter, for a factor of 1."""
-        A, b = self.information, self.right_side
-        column = np.append(A[:, k], A[k, k] * step) * step
-        information = np.vstack([np.column_stack([A, column[:-1]]), column])
-        placed = replace(x, columns=(len(b) - self.outer - len(self.group),))
-        return replace(
-            self,
-            information=information,
-            right_side=np.append(b, b[k] * step),
-            candidates=(*self.candidates, placed),
-            amount_std=np.append(self.amount_std, amount_std),
         )
 
     @property
@@ -144,14 +129,14 @@ def build_form(
     for k, one in enumerate(unknown.groups):
         group[one.every] = k
     machine = along[0].space.model.machine
-    std = [factor_std(x.placed, machine, duration) for x in found for _ in x.columns]
+    std = [
+        AMOUNT_STD
+        * x.placed.effect.typical_magnitude(Site.of(machine, x.placed.bodies, duration))
+        / abs(x.placed.values["A"])
+        for x in found
+        for _ in x.columns
+    ]
     return Form(A, b, K, group, tuple(g.name for g in unknown.groups), tuple(found), np.array(std))
-
-
-def factor_std(placed: PlacedEffect, machine: Machine, duration: float) -> float:
-    """Return the prior standard deviation of a factor on an effect's magnitude; duration [s]: of the longest log."""
-    typical = placed.effect.typical_magnitude(Site.of(machine, placed.bodies, duration))
-    return AMOUNT_STD * typical / abs(placed.values["A"])
 
 
 def _products(log: FittedLog, found: Sequence[Candidate]) -> np.ndarray:

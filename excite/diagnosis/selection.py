@@ -419,9 +419,8 @@ def _judged(
     if not stage.exact or deadline.is_over() or not names:
         return stage, tuple(Choice(n, stage.wald(n), None) for n in names)
     form = every or stage.form(_every_candidate(stage), runner)
-    form = replace(form, candidates=tuple(candidates_of(stage, form.candidates)))
+    tried = [(name, entry) for name in names for entry in _likely_rivals(form, stage, name, runner)]
     stage.release()
-    tried = [(name, entry) for name in names for entry in _likely_rivals(form, stage, name)]
     machines = [effects.with_effects(_without(stage, [name]), entry) for name, entry in tried]
     rivals: dict[str, list[tuple[float, EffectEntry]]] = {name: [] for name in names}  # with their information
     most = stage.fit.cost + 2 * (stage.data.noise_cost - stage.data.n_readings) + MAX_FORMULA_RATIO
@@ -455,21 +454,27 @@ def information(stage: ExtendedFit, name: str) -> float:
     return stage.deviance + float(np.log(stage.data.n_readings)) * degrees_of_freedom(name, stage)
 
 
-def _likely_rivals(form: evidence.Form, stage: ExtendedFit, name: str) -> list[EffectEntry]:
+def _likely_rivals(every: evidence.Form, stage: ExtendedFit, name: str, runner: CallRunner) -> list[EffectEntry]:
     """Return the candidates that to first order gain about as much as an effect in its place, best first."""
-    at, itself = stage.parameters_of(name), stage.fitted(name)
-    own = stage.model.base.names.index(name)
-    # an effect goes with its magnitude, or with the inverse of it
-    step = float(stage.fit.X[own] / stage.model.scale[own]) * (-1 if itself.effect.inverse else 1)
-    std = evidence.factor_std(itself, stage.machine, stage.data.duration)
-    form = form.with_parameter(own, step, Candidate(itself, (0,)), std)
-    form = form.without(at, np.array([-step if k == own else 0.0 for k in at])).reduced()
-    gains = evidence.first_gains(form, (), form.nothing)
+    form, gains = _in_place_of(every, stage, name)
     known = {e.name for e in stage.model.effects}
+    possible = {x.name for x in candidates_of(stage, form.candidates)} - known
+    best = evidence.best_of_each(form, gains, lambda x: x.name, 0.0)
+    found = [x for x in (form.candidates[k] for k in best) if x.name in possible][:MAX_RIVALS]
+    if not found:
+        return []
+    form, gains = _in_place_of(stage.form([*found, Candidate(stage.fitted(name), (0,))], runner), stage, name)
     least = max(gains[-1] - max(RIVAL_LOSS, RIVAL_LOSS_SHARE * gains[-1]), 0.0)
-    best = evidence.best_of_each(form, gains, lambda x: x.name, least)
-    rivals = [x for x in (form.candidates[k] for k in best) if x.name not in known][:MAX_RIVALS]
+    rivals = [x for x, gain in zip(form.candidates[:-1], gains[:-1], strict=True) if gain > least]
     return [_start_entry(x, evidence.posterior(form, [x], form.nothing, 0).factors(form, [x])[0]) for x in rivals]
+
+
+def _in_place_of(form: evidence.Form, stage: ExtendedFit, name: str) -> tuple[evidence.Form, np.ndarray]:
+    """Return the form without an effect of the model, and the gain of each candidate then."""
+    at, own = stage.parameters_of(name), stage.model.base.names.index(name)
+    value = np.array([-stage.fit.X[k] / stage.model.scale[k] if k == own else 0.0 for k in at])
+    form = form.without(at, value).reduced()
+    return form, evidence.first_gains(form, (), form.nothing)
 
 
 def _with_presliding(stage: ExtendedFit, runner: CallRunner) -> ExtendedFit:

@@ -163,26 +163,6 @@ def test_a_form_without_parameters_is_that_of_data_without_what_they_hold() -> N
     assert found == pytest.approx(evidence.posterior(rest.form.reduced(), chosen, LOGS, 0).gain)
 
 
-def test_a_parameter_is_a_candidate_with_the_signature_of_its_column() -> None:
-    """Where it is held elsewhere, it gains what that column of the data would."""
-    x, at, step, std = linear(precision=0.0), 1, 0.6, 0.8
-    (further,) = candidates([1])
-    held = replace(x.form, candidates=x.candidates[1:]).with_parameter(at, step, further, std)
-    held = held.without([at], np.array([-step]))
-    rest = replace(
-        x,
-        y=x.y + step * x.P[:, at],
-        P=np.delete(x.P, at, axis=1),
-        V=np.column_stack([x.V, step * x.P[:, at]]),
-        precision=np.delete(x.precision, at),
-        candidates=(*x.candidates[1:], replace(further, columns=(x.V.shape[1],))),
-        std=np.append(x.std, std),
-    )
-    found, expected = (evidence.first_gains(f.reduced(), (), LOGS) for f in (held, rest.form))
-    assert len(expected) == len(x.candidates)
-    np.testing.assert_allclose(found, expected, atol=1e-8)
-
-
 def pairs(rng: np.random.Generator, amounts: np.ndarray) -> Linear:
     """Thirty columns in pairs that correlate at 0.9, with these amounts, beside two groups of unknown forces."""
     N, group = 300, np.repeat([0, 1], 6)
