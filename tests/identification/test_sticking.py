@@ -11,7 +11,7 @@ from excite.logs import prepare
 from excite.model import Model
 
 truth = np.array(list(TRUTH.values()))
-RUNS = 5
+RUNS = 3
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def found(emps: Model) -> dict[str, list[Estimate]]:
 @pytest.mark.slow
 def test_intervals_hold_where_friction_sticks(found: dict[str, list[Estimate]]) -> None:
     inside = [(e.interval95[0] <= truth) & (truth <= e.interval95[1]) for e in found["joint"]]
-    assert np.mean(inside) > 0.85  # 20 intervals: 0.90 is expected to be reached over many
+    assert np.mean(inside) > 0.8  # 12 intervals
     assert all(e.status == "valid" for e in found["joint"])
 
 

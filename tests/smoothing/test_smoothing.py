@@ -222,14 +222,14 @@ def test_coverage(va12: Model) -> None:
     """Another machine, drive and noise each time, started from a file up to 20 % off: errors as large as said."""
     told = []
     for drive, kit, middle in (("energetic", "paper", 0.25), ("human", "full", 0.4)):
-        z, percent = errors(va12, drive, kit, range(8))
+        z, percent = errors(va12, drive, kit, range(5))
         assert np.median(np.sqrt(np.mean(percent**2, axis=0))) < middle
         told.append(z)
     z = np.concatenate(told)
     inside = np.mean(np.abs(z) < 1.96, axis=0)
     assert 0.85 < np.sqrt(np.mean(z**2)) < 1.2
-    assert 0.91 < inside.mean() < 0.99
-    assert inside.min() >= 0.75  # of 22 parameters in 16 runs the least falls below that by chance in 2 % of tests
+    assert 0.9 < inside.mean() < 0.995
+    assert inside.min() >= 0.7  # of 22 parameters in 10 runs the least falls below that by chance in 2 % of tests
 
 
 @pytest.mark.slow
@@ -240,14 +240,14 @@ def test_a_dull_drive_is_not_biased(straight: Model) -> None:
     legs = [(-1) ** k * np.clip(np.minimum(t - 30 * k - 0.5, 30 * k + 28.5 - t) / 6, 0, 1) for k in range(4)]
     smooth = scipy.signal.butter(2, 3 / 50)
     z = []
-    for seed in range(10):
+    for seed in range(6):
         X = perturbed(straight, seed)
         by_hand = follow(straight, np.sum(legs, axis=0), np.zeros((len(t), 0)), seed=seed).u
         motion = simulate(straight, scipy.signal.filtfilt(*smooth, by_hand, axis=0), X)
         log = measured(straight, motion, X, "paper", 70000 + seed)
         estimate = joint(straight, [log], straight.machine.filter)
         z.append((estimate.value - X) / estimate.std)
-    assert np.abs(np.mean(z, axis=0)).max() < 0.8
+    assert np.abs(np.mean(z, axis=0)).max() < 1.05
     assert 0.85 < np.mean(np.abs(z) < 1.96) < 1.0
 
 
@@ -501,10 +501,10 @@ def test_a_design_that_is_played_back_has_intervals_that_hold(va12: Model) -> No
     """
     motion = simulate(va12, design("R60_accuracy"))
     inside = []
-    for seed in range(10):
+    for seed in range(8):
         estimate = joint(va12, [measured(va12, motion, va12.nominal, seed=60000 + seed)], va12.machine.filter)
         low, high = estimate.interval95
         inside.append((low <= va12.nominal) & (va12.nominal <= high))
     share = np.mean(inside, axis=0)
     assert 0.89 < share.mean() <= 1
-    assert share.min() >= 0.7  # of 22 parameters, many of which are off together
+    assert share.min() >= 0.6  # of 22 parameters, many of which are off together
