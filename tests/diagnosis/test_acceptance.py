@@ -57,12 +57,6 @@ def file_with(tmp_path: Path, text: str) -> Path:
     ("wrong", "name", "amount"),
     [
         pytest.param(
-            '[body.rear_axle_frame]\nd = { value = -1.755, source = "measured" }\n',
-            "contact_position@rear_roll",
-            -0.005,
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
             "".join(
                 f'[body.{roll}.contact]\nradius = {{ value = {radius}, source = "measured" }}\n'
                 for roll, radius in (("front_roll", 0.652), ("rear_roll", 0.652))
