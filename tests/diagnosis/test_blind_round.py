@@ -245,10 +245,10 @@ def test_the_study_takes_cases_that_no_test_knows() -> None:
 
 
 @pytest.mark.slow
-def test_most_plain_causes_are_named_and_hardly_any_wrongly() -> None:
-    """One case of every sixteenth cause; the study in results/diagnosis has all, of any size."""
+def test_plain_causes_are_named() -> None:
+    """Two of the causes; the study in results/diagnosis has all, of any size."""
     told: dict[str, str] = {}
-    for name, number in list(PLAIN.items())[::16]:
+    for name, number in list(PLAIN.items())[::26]:
         seen = blind(case("cause", name, number))
         assert visibility(seen) > 10 * VISIBLE
         told[seen.case.key] = score(seen.case, ask(seen.log)).outcome
