@@ -268,16 +268,6 @@ def test_what_is_so_strong_that_nothing_follows_the_log_is_named() -> None:
 
 
 @pytest.mark.slow
-def test_compaction_that_a_map_of_the_ground_counts_is_named() -> None:
-    """One way: the front roll on new ground, the rear one on what that has passed over, which tells what a pass does
-    and not how many are to come."""
-    one = case("cause", "compaction_per_pass", 1)
-    judged = score(one, ask(blind(one).log))
-    assert judged.outcome == "right", judged
-    assert judged.amount_in, judged
-
-
-@pytest.mark.slow
 @pytest.mark.xfail(
     reason="beside unknown forces a turning moment gains more than the vibration, which alone is no fit", run=False
 )
@@ -285,12 +275,6 @@ def test_of_two_that_nothing_follows_the_stronger_is_named() -> None:
     """A roll's vibration beside a gain a hundredth as plain: only very coarse sensors follow the log without a name."""
     one = case("pair", "", 20)
     assert score(one, ask(blind(one).log)).outcome in ("right", "part")
-
-
-@pytest.mark.slow
-def test_hardly_any_clean_log_is_accused() -> None:
-    told = {k: score(case("nothing", "", k), ask(blind(case("nothing", "", k)).log)).outcome for k in range(2)}
-    assert set(told.values()) == {"clean"}, told
 
 
 @pytest.mark.slow
@@ -302,13 +286,6 @@ def test_a_surprise_gets_no_name() -> None:
     assert "stuck_bit" in SURPRISES
     one = case("surprise", "stuck_bit", 2)
     assert score(one, ask(blind(one).log)).outcome in ("unexplained", "clean")
-
-
-@pytest.mark.slow
-def test_a_worn_roll_is_an_error_of_the_radius_in_the_machine_file() -> None:
-    """It is not rolling resistance, which would have to drive the machine."""
-    one = case("surprise", "worn_roll", 1)
-    assert score(one, ask(blind(one).log)).outcome == "tied"
 
 
 @pytest.mark.slow

@@ -78,20 +78,6 @@ def test_a_clean_log_of_the_second_roller_leaves_nothing(va12: Model) -> None:
 
 
 @pytest.mark.slow
-def test_a_strong_cause_does_not_hide_a_clear_one() -> None:
-    """A relief valve that takes 99 % of the misfit, beside a saturation of the soil a hundred times above noise."""
-    said = ask(attacked(attack("strong_and_weak", 602)).log)
-    assert [(f["effect"], f["where"]) for f in said["findings"]] == [
-        ("relief_valve", "rear_roll"),
-        ("shear_saturation", "rear_roll"),
-    ]
-    for f, truth in zip(said["findings"], (0.848, 0.36), strict=True):
-        assert abs(f["amount"] - truth) < 2 * f["amount_std"]
-    assert said["findings"][0]["share_percent"] < 99.9
-    assert said["remainder"]["chi2"] < 1000
-
-
-@pytest.mark.slow
 def test_what_grows_with_torque_has_a_name() -> None:
     said = ask(attacked(attack("pressure_leakage", 601)).log)
     assert said["verdict"] == "named"
