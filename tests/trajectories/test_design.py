@@ -438,20 +438,6 @@ def test_few_reversals_are_kept(straight: Model, most: int) -> None:
     assert d.violations["reversals"] == 0
 
 
-@pytest.mark.slow
-def test_r60_within_a_triangle_and_with_two_reversals(va12: Model) -> None:
-    corners = ((-18.0, -9.0), (18.0, -9.0), (0.0, 14.0))
-    problem = va12.machine.problems["R60"].model_copy(update={"lane_polygon_m": corners, "reversals": 2})
-    d = design(va12, problem, starts=2, seed=0)
-    assert d.max_violation <= TOLERANCE
-    assert count_reversals(d.motion) <= 2
-    places = va12.kinematics(d.motion.q.T, d.motion.nu.T)[3].full().reshape(3, len(d.motion.t), -1)
-    bodies = [b.index for b in va12.machine.body]
-    area = MplPath(np.array(corners))
-    for i in (0, 4):
-        assert area.contains_points(places[:2, :, bodies.index(i)].T, radius=0.05).all()
-
-
 def test_a_drive_to_start_from_is_not_made_worse(straight: Model, quick: Design) -> None:
     problem = shorter(straight, 12.0)
     again = design(straight, problem, starts=0, warm=[quick.manoeuvre])

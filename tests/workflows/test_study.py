@@ -939,21 +939,3 @@ def workers_of(driver: int) -> list[int]:
     """The processes that compute for a driver, the oldest first."""
     children = Path(f"/proc/{driver}/task/{driver}/children").read_text().split()
     return [int(p) for p in children if b"LokyProcess" in Path(f"/proc/{p}/cmdline").read_bytes()]
-
-
-@pytest.mark.slow
-def test_killed_workers_of_this_machine_cost_nothing(whole: Command, carried: Callable[..., Command]) -> None:
-    """The plain command on two cores: three of its workers are killed (-9) under way."""
-    struck = carried("--jobs", "2")
-    kept, killed = 0, set()
-    for k in range(3):
-        kept = struck.midway(kept + RUNS // 10)
-        while len(there := workers_of(struck.run.pid)) < 2:  # those that follow the last one are being started
-            assert struck.run.poll() is None, struck.said()
-            time.sleep(0.02)
-        victim = there[k % 2]
-        os.kill(victim, signal.SIGKILL)
-        killed.add(victim)
-    assert len(killed) == 3
-    struck.said()
-    struck.same_as(whole)
