@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.linalg import lapack
 
 from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.score_test import (
@@ -26,7 +27,8 @@ from excite.diagnosis.score_test import (
     SignatureColumns,
     renumber_columns,
 )
-from excite.model.effects import Site
+from excite.model.effects import PlacedEffect, Site
+from excite.model.machine import Machine
 from excite.smoothing import SIZE_SCATTER, Fit, UnknownForces, sizes_step
 
 AMOUNT_STD = 2.0  # prior standard deviation of an amount, over its typical size
@@ -129,14 +131,14 @@ def build_form(
     for k, one in enumerate(unknown.groups):
         group[one.every] = k
     machine = along[0].space.model.machine
-    std = [
-        AMOUNT_STD
-        * x.placed.effect.typical_magnitude(Site.of(machine, x.placed.bodies, duration))
-        / abs(x.placed.values["A"])
-        for x in found
-        for _ in x.columns
-    ]
+    std = [amount_std(machine, x.placed, duration) for x in found for _ in x.columns]
     return Form(A, b, K, group, tuple(g.name for g in unknown.groups), tuple(found), np.array(std))
+
+
+def amount_std(machine: Machine, placed: PlacedEffect, duration: float) -> float:
+    """Return the prior standard deviation of an effect's amount, over its own, for logs of a duration [s]."""
+    typical = placed.effect.typical_magnitude(Site.of(machine, placed.bodies, duration))
+    return float(AMOUNT_STD * typical / abs(placed.values["A"]))
 
 
 def _products(log: FittedLog, found: Sequence[Candidate]) -> np.ndarray:
@@ -156,9 +158,10 @@ def posterior(
         size = np.r_[np.exp(logs)[form.group], fixed]
         whole = size[:, None] * information * size
         whole[range(len(size)), range(len(size))] += 1
-        inverse, pull = np.linalg.inv(whole), size * right_side
-        mean = inverse @ pull
-        return mean, np.diag(inverse), float(pull @ mean - np.linalg.slogdet(whole)[1]), size
+        root, pull = lapack.dpotrf(whole, lower=1)[0], size * right_side
+        mean = lapack.dpotrs(root, pull, lower=1)[0]
+        variance = np.diag(lapack.dpotri(root, lower=1)[0])
+        return mean, variance, float(pull @ mean - 2 * np.log(np.diag(root)).sum()), size
 
     if logs is None:
         levels = [np.full(n, level) for level in LEVELS]
@@ -219,16 +222,17 @@ class Chosen:
     sizes: tuple[float, ...]
 
 
-def least_gain(form: Form) -> float:
-    """Return the gain from which a candidate is added: MIN_ODDS, given the number of names tried."""
-    return float(2 * np.log(MIN_ODDS * max(len({x.name for x in form.candidates}), 1)))
+def least_gain(form: Form, odds: float = MIN_ODDS) -> float:
+    """Return the gain from which a candidate is added by its odds, given the number of names tried."""
+    return float(2 * np.log(odds * max(len({x.name for x in form.candidates}), 1)))
 
 
-def choose(form: Form, known: Collection[str] = ()) -> Chosen:
+def choose(form: Form, known: Collection[str] = (), odds: float = MIN_ODDS) -> Chosen:
     """Add candidates one after the other, the one with the largest gain first, as long as the gain is clear.
 
     known: names of effects in the model, candidates of which are further harmonics. They are not added, but nothing
-    that is as well a harmonic of them is, such as a ripple of another wheel that turns equally fast.
+    that is as well a harmonic of them is, such as a ripple of another wheel that turns equally fast. odds: posterior
+    odds over unknown forces alone from which a candidate is added.
 
     One gain alone counts where later ones are below MIN_SHARE of it: to first order, they may be errors of its form.
     """
@@ -238,9 +242,12 @@ def choose(form: Form, known: Collection[str] = ()) -> Chosen:
     chosen, gains = list[Candidate](), list[float]()
     while len(chosen) < MOST_AT_ONCE:
         now = _exchanged(form, chosen, now, known)
-        first = _without_harmonics(form, first_gains(form, chosen, now.logs), known)
         taken = {x.name for x in chosen}
-        finalists = [k for k in _best_of_each_variant(form, first) if form.candidates[k].name not in taken][:FINALISTS]
+        finalists = list[int]()
+        for logs in (now.logs, form.nothing):  # curves hide what they explain as well
+            first = _without_harmonics(form, first_gains(form, chosen, logs), known)
+            others = [k for k in _best_of_each_variant(form, first) if form.candidates[k].name not in taken]
+            finalists += [k for k in others[:FINALISTS] if k not in finalists]
         tried = [(k, _beside(form, [*chosen, form.candidates[k]], now.logs)) for k in finalists]
         tried = [
             (k, p)
@@ -251,7 +258,7 @@ def choose(form: Form, known: Collection[str] = ()) -> Chosen:
             break
         k, best = max(tried, key=lambda x: x[1].gain)
         gain = best.gain - now.gain
-        if gain < max(least_gain(form), MIN_SHARE * gains[0] if gains else 0.0):
+        if gain < max(least_gain(form, odds), MIN_SHARE * gains[0] if gains else 0.0):
             break
         chosen.append(form.candidates[k])
         gains.append(gain)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +24,6 @@ from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.residuals import InnovationLevel
 from excite.diagnosis.selection import ProgressCallback
 from excite.diagnosis.torque_regression import TorqueDiagnosis
-from excite.errors import NoEstimateError, NotIdentifiableError
 from excite.identification import Agreement
 from excite.logs import Log
 from excite.model import Model
@@ -35,7 +33,6 @@ from excite.text import format_number, format_rounded, format_uncertain
 MACHINE_FILE_DIGITS = 8  # significant digits of magnitudes in a machine file; chosen
 FIRST_ANOMALY_LINES = 3  # lines about anomalies that precede all others; chosen
 MIN_NEAREST_SHARE = 0.05  # share of the misfit above which the nearest effect is mentioned; chosen
-MAX_FOLLOWED_JOINTS = 3  # driven joints of a machine without slips whose motion is followed in open loop; chosen
 DIAGNOSE_SHARE = 0.8  # of the progress; gains take the rest; chosen
 FULL_EXPLANATION_SHARE = 0.99  # share of the misfit below which the answer gives it; chosen
 
@@ -159,14 +156,11 @@ def explain(
     runner: CallRunner = run_in_turn,
     budget_s: float | None = None,
 ) -> Assessment:
-    """Diagnose logs by joint smoothing, or by regression on the torques where that says more.
+    """Diagnose logs by joint smoothing, or by regression on the torques where all joints are driven and rigid.
 
-    Joint smoothing needs a motion that is followed in open loop. For a machine without slips and effects whose joints
-    are all driven and which has no known values, regression takes its place where there are more than
-    MAX_FOLLOWED_JOINTS joints, where smoothing finds no estimate, or where it leaves something unexplained and the
-    corrections of regression surely gain more. Several logs are compared first: if each alone is explained and they
-    differ in parameters, that is the answer. budget_s [s]: after it, and after a first Ctrl-C, nothing new is begun,
-    and the best answer so far is given. Raises NoEstimateError.
+    Several logs are compared first: if each alone is explained and they differ in parameters, that is the answer.
+    budget_s [s]: after it, and after a first Ctrl-C, nothing new is begun, and the best answer so far is given. Raises
+    NoEstimateError.
     """
     differences = _find_differences(model, logs, filter)
     if differences is not None:
@@ -193,7 +187,7 @@ def explain(
 
 def _find_differences(model: Model, logs: Sequence[Log], filter: Filter) -> Agreement | None:
     """Return what differs between several logs of which each alone is explained down to noise; None if nothing."""
-    if model.effects or (not model.slips and len(model.actuated) > MAX_FOLLOWED_JOINTS):
+    if model.effects or torque_regression.by_torques(model):
         return None
     agreement, estimates = identification.compare_sources(model, logs, "joint", filter, explained=True)
     if agreement is None or agreement.agree or any(e.status != "valid" for e in estimates):
@@ -209,44 +203,12 @@ def _explain(
     runner: CallRunner,
     deadline: Deadline,
 ) -> Assessment:
-    """Diagnose as `explain` does. Within a budget regression comes first: it takes seconds, smoothing may take all."""
-    report = progress or (lambda share, what: None)
-    driven = len(model.actuated) == len(model.coordinates)
-    by_torques = driven and not model.slips and model.plain and not model.known
-
-    def regress(report: ProgressCallback = report) -> Assessment:
-        return assess_torques(*torque_regression.diagnose_torques(model, logs, filter, report, deadline))
-
-    if by_torques and len(model.actuated) > MAX_FOLLOWED_JOINTS:
-        return regress()
-    regression: Assessment | None = None
-    if by_torques and deadline.seconds is not None:
-        with contextlib.suppress(NotIdentifiableError):
-            regression = regress(lambda share, what: report(0.0, what))
-    try:
-        found = diagnose(
-            model, logs, filter, lambda share, what: report(DIAGNOSE_SHARE * share, what), runner, deadline
-        )
-    except NoEstimateError:
-        if not by_torques:
-            raise
-        return regression or regress()
-    left = 1 - DIAGNOSE_SHARE
-    account = assess(found, lambda share, what: report(DIAGNOSE_SHARE + left * share, what), runner, deadline)
-    if not by_torques or account.diagnosis.verdict != "unexplained":
-        return account
-    try:
-        other = regression or regress()
-    except NotIdentifiableError:
-        return account
-    return other if other.diagnosis.findings and _least_gain(other) > _least_gain(account) else account
-
-
-def _least_gain(a: Assessment) -> float:
-    """Lower end of the gain of all findings [%], 0 without any."""
-    if not (a.diagnosis.findings and a.total_gain):
-        return 0.0
-    return a.total_gain.interval[0] if a.total_gain.interval else 0.0
+    """Diagnose as `explain` does."""
+    if torque_regression.by_torques(model):
+        return assess_torques(*torque_regression.diagnose_torques(model, logs, filter, progress, deadline))
+    report, left = progress or (lambda share, what: None), 1 - DIAGNOSE_SHARE
+    found = diagnose(model, logs, filter, lambda share, what: report(DIAGNOSE_SHARE * share, what), runner, deadline)
+    return assess(found, lambda share, what: report(DIAGNOSE_SHARE + left * share, what), runner, deadline)
 
 
 def assess_torques(d: TorqueDiagnosis, errors: Sequence[HoldOutErrors]) -> Assessment:

@@ -108,6 +108,11 @@ class ExtendedFit:
     def model(self) -> Model:
         return self.data.space.model
 
+    @property
+    def duration(self) -> float:
+        """Duration of the longest log [s]."""
+        return self.data.duration
+
     def placed(self, name: str) -> PlacedEffect:
         """Return an effect of the model by its name."""
         return next(e for e in self.model.effects if e.name == name)

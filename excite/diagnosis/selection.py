@@ -124,7 +124,7 @@ def _extended(
 ) -> ExtendedFit | None:
     """Return the fit with chosen effects, as far as it needs them; None if there is none."""
     others = _alternatives(form, chosen)
-    machine = effects.with_effects(stage.machine, *entries(_refined(stage, chosen, runner)))
+    machine = effects.with_effects(stage.machine, *entries(refined(stage, chosen, runner)))
     stage.release()
     try:
         return _without_idle(before, _with_best_shapes(refit(machine, stage), others, runner), idle, dropped)
@@ -215,7 +215,7 @@ def candidates_of(stage: ExtendedFit, every: Sequence[Candidate] | None = None) 
 def _every_candidate(stage: ExtendedFit) -> list[Candidate]:
     """List every effect with trial values, the same for every stage of a search."""
     sensors = [s.name for s in stage.data.space.sensors]
-    return score_test.candidates(stage.machine, sensors, stage.data.duration)
+    return score_test.candidates(stage.machine, sensors, stage.duration)
 
 
 def _has_harmonics(effect: Effect) -> bool:
@@ -223,9 +223,18 @@ def _has_harmonics(effect: Effect) -> bool:
     return any(s.circular for s in shapes) and any(s.whole and len(s.grid) > 1 for s in shapes)
 
 
-def _refined(stage: ExtendedFit, found: Chosen, runner: CallRunner) -> Chosen:
+@dataclass(frozen=True)
+class Scored:
+    """What scores candidates: a machine, the duration [s] of the longest log, and forms of some candidates."""
+
+    machine: Machine
+    duration: float
+    form: Callable[[Sequence[Candidate], CallRunner], evidence.Form]
+
+
+def refined(stage: ExtendedFit | Scored, found: Chosen, runner: CallRunner) -> Chosen:
     """Refine magnitudes, shapes and instants of chosen candidates between their trial values."""
-    duration = stage.data.duration
+    duration = stage.duration
     reaches, timed = [*REFINEMENT_REACHES], list[float]()
     while [*reaches, *timed][-1] * duration / TIME_TRIAL_SHARE > INSTANT_ACCURACY_S:
         timed.append([*reaches, *timed][-1] * REFINEMENT_REACHES[-1])
@@ -241,7 +250,7 @@ def _refined(stage: ExtendedFit, found: Chosen, runner: CallRunner) -> Chosen:
     return found
 
 
-def _best_nearby(stage: ExtendedFit, lists: Sequence[Sequence[Candidate]], runner: CallRunner) -> Chosen:
+def _best_nearby(stage: ExtendedFit | Scored, lists: Sequence[Sequence[Candidate]], runner: CallRunner) -> Chosen:
     """Return the best of each list of candidates, the first of each to begin with, beside those of the others."""
     form = stage.form([x for own in lists for x in own], runner).reduced()
     every, at = list(form.candidates), 0

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
+import scipy.linalg
 
 from excite.diagnosis.hold_out import HoldOutErrors, torque_names
 from excite.diagnosis.torque_rows import STRETCHES, TorqueRows
 from excite.model import Model
 from excite.model.effects import PlacedEffect
 
-LAGS = 8  # order of the autoregression of the residuals; chosen
+LAGS = 8  # order of the autoregression of what is left beside a course; chosen
+LONGEST_COURSE = 0.25  # of the rows, the longest correlation of a course; chosen
+COURSE_TIMES, WHITE_SHARES = 12, np.geomspace(1e-3, 1.0, 8)  # that are tried; of the variance, what is white
 LEVEL_PASSES = 4  # of the iteration for the rows' levels; chosen
 WHITE_SHARE = 0.01  # of the residuals taken for white noise, as a low-pass leaves none at high frequency; chosen
 FOLDS = 5  # parts that are withheld in turn; chosen
@@ -25,8 +28,7 @@ class Term:
 
     columns: torques (n_rows, n, width) for each log; for an effect one, and a coefficient of 1 stands for the magnitude
     of `placed`. slopes: of the column by relative changes of the shapes `free`, (n_rows, n, m). by_magnitude: slope of
-    the column by a relative change of a magnitude that it is not proportional to, (n_rows, n, 1). chi2: of the effect,
-    when it was added.
+    the column by a relative change of a magnitude that it is not proportional to, (n_rows, n, 1).
     """
 
     placed: PlacedEffect | None
@@ -34,7 +36,6 @@ class Term:
     slopes: list[np.ndarray]
     free: tuple[str, ...] = ()
     by_magnitude: list[np.ndarray] | None = None
-    chi2: float = 0.0
 
     @property
     def name(self) -> str:
@@ -48,6 +49,95 @@ class Term:
     @property
     def width(self) -> int:
         return self.columns[0].shape[2]
+
+
+@dataclass(frozen=True)
+class Whitening:
+    """Turns residuals of a torque into white noise of variance 1, whatever rows are left out.
+
+    They are a course (a stationary first-order process), white noise, and what is left of both is autoregressive. stay:
+    correlation of the course from row to row. share: of the variance, what is white. size: of the innovations. past
+    (LAGS,): coefficients of the innovations before.
+    """
+
+    stay: float
+    share: float
+    size: float
+    past: np.ndarray
+
+    def __call__(self, values: np.ndarray, used: np.ndarray) -> np.ndarray:
+        """Return the innovations (n, ...) of values (n, ...), zero where rows are not used."""
+        variance, gain = course_gains(used, np.array([self.stay]), np.array([self.share]))
+        flat = values.reshape(len(values), -1)
+        found = innovations(flat, used, self.stay, variance[:, 0], gain[:, 0]) / self.size
+        white = found.copy()
+        for k, a in enumerate(self.past, 1):
+            white[k:] -= a * found[:-k]
+        white[~used] = 0.0
+        return white.reshape(values.shape)
+
+
+def course_gains(used: np.ndarray, stay: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the variances of innovations and the gains (n, P) of a Kalman filter of a course beside white noise.
+
+    used (n,): rows that count. stay, share (P,): see `Whitening`; the variance of both together is 1.
+    """
+    return _course_gains(used.tobytes(), tuple(stay), tuple(share))
+
+
+@lru_cache(maxsize=128)
+def _course_gains(rows: bytes, stays: tuple[float, ...], shares: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    used, stay, share = np.frombuffer(rows, bool), np.array(stays), np.array(shares)
+    total, gain = np.ones((len(used), len(stay))), np.zeros((len(used), len(stay)))
+    variance, drive = 1 - share, (1 - share) * (1 - stay**2)
+    for k, there in enumerate(used):
+        if there:
+            total[k] = variance + share
+            gain[k] = variance / total[k]
+            variance = (1 - gain[k]) * variance
+        variance = stay**2 * variance + drive
+    return total, gain
+
+
+def innovations(
+    values: np.ndarray, used: np.ndarray, stay: float, variance: np.ndarray, gain: np.ndarray
+) -> np.ndarray:
+    """Return standardised innovations (n, C) of columns (n, C), zero where rows are not used."""
+    known = np.where(used[:, None], values, 0.0)
+    band = np.ones((2, len(values)))
+    band[1] = -stay * (1 - gain)
+    mean = scipy.linalg.solve_banded((1, 0), band, stay * gain[:, None] * known, check_finite=False)
+    before = np.concatenate([np.zeros((1, known.shape[1])), mean[:-1]])
+    return np.asarray((known - before) * used[:, None] / np.sqrt(variance)[:, None])
+
+
+def find_whitening(pairs: Sequence[tuple[np.ndarray, np.ndarray]], least: float) -> Whitening:
+    """Return the most likely whitening of residuals (n,), of which rows are used (n,), of some logs.
+
+    least: size of innovations at least.
+    """
+    longest = max(LONGEST_COURSE * max(len(e) for e, _ in pairs), 2.0)
+    times = np.geomspace(1.0, longest, COURSE_TIMES)
+    stay, share = (x.ravel() for x in np.meshgrid(np.exp(-1 / times), WHITE_SHARES))
+    count = sum(int(used.sum()) for _, used in pairs)
+    cost, gains = np.zeros((2, len(stay))), [course_gains(used, stay, share) for _, used in pairs]
+    for (e, used), (variance, gain) in zip(pairs, gains, strict=True):
+        for k, own in enumerate(stay):
+            cost[0, k] += (innovations(e[:, None], used, own, variance[:, k], gain[:, k]) ** 2).sum()
+        cost[1] += np.log(variance).sum(axis=0)
+    best = int(np.argmin(count * np.log(np.maximum(cost[0], 1e-300)) + cost[1]))
+    past, now = [], []
+    for (e, used), (variance, gain) in zip(pairs, gains, strict=True):
+        z = innovations(e[:, None], used, stay[best], variance[:, best], gain[:, best])[:, 0]
+        lagged = np.column_stack([np.concatenate([np.zeros(k), z[: len(z) - k]]) for k in range(1, LAGS + 1)])
+        past.append(lagged[used])
+        now.append(z[used])
+    P, y = np.concatenate(past), np.concatenate(now)
+    level = float(np.sqrt(np.mean(y**2))) if len(y) else 1.0
+    ridge = np.sqrt(WHITE_SHARE * len(y)) * level * np.eye(LAGS)
+    a = np.linalg.lstsq(np.concatenate([P, ridge]), np.append(y, np.zeros(LAGS)), rcond=None)[0]
+    size = float(np.sqrt(np.mean((y - P @ a) ** 2))) if len(y) else 1.0
+    return Whitening(float(stay[best]), float(share[best]), max(size, least), a)
 
 
 class TorqueFit:
@@ -70,7 +160,7 @@ class TorqueFit:
             self.x = solve(np.concatenate([R / level for R, level in zip(each, self.level, strict=True)]))
             self.residual = [r.Y - A @ self.x for r, A in zip(rows, self.design, strict=True)]
             self.level = np.maximum(self._level(self.residual), lowest)
-        self.autoregression = self._autoregression()
+        self.whitening = self._whitening()
         self._predicted: dict[TorqueFit, tuple[np.ndarray, HoldOutErrors]] = {}
 
     def without(self, term: Term) -> TorqueFit:
@@ -91,21 +181,13 @@ class TorqueFit:
         square = sum((e**2 * r.used).sum(axis=1) for e, r in zip(errors, self.rows, strict=True))
         return np.sqrt(square / np.maximum(sum(r.used.sum(axis=1) for r in self.rows), 1))
 
-    def _autoregression(self) -> np.ndarray:
-        """Filters (n_rows, lags + 1) that turn the residuals of each row into white noise of variance 1."""
-        filters = np.zeros((len(self.level), LAGS + 1))
-        for k, level in enumerate(self.level):
-            past, now = [], []
-            for e, r in zip(self.residual, self.rows, strict=True):
-                lagged = _lagged(e[k])[_whole(r.used[k])]
-                past.append(lagged[:, 1:])
-                now.append(lagged[:, 0])
-            P, y = np.concatenate(past), np.concatenate(now)
-            ridge = np.sqrt(WHITE_SHARE * len(y)) * level * np.eye(LAGS)
-            a = np.linalg.lstsq(np.concatenate([P, ridge]), np.append(y, np.zeros(LAGS)), rcond=None)[0]
-            size = np.sqrt(np.mean((y - P @ a) ** 2)) if len(y) else level
-            filters[k] = np.append(1.0, -a) / max(size, 1e-3 * self.lowest[k], 1e-12)
-        return filters
+    def _whitening(self) -> list[Whitening]:
+        """What turns the residuals of each row into white noise of variance 1."""
+        found = []
+        for k, lowest in enumerate(self.lowest):
+            pairs = [(e[k], r.used[k]) for e, r in zip(self.residual, self.rows, strict=True)]
+            found.append(find_whitening(pairs, max(1e-3 * float(lowest), 1e-12)))
+        return found
 
     def _weight(self, values: np.ndarray, r: TorqueRows) -> np.ndarray:
         """Rows in motion over their level, (n, ...) from (n_rows, n, ...)."""
@@ -114,22 +196,14 @@ class TorqueFit:
 
     def _whiten(self, values: np.ndarray, r: TorqueRows) -> np.ndarray:
         """Innovations of rows in motion, (n, ...) from (n_rows, n, ...)."""
-        return np.concatenate(
-            [
-                sum(a * v[LAGS - k : len(v) - k] for k, a in enumerate(f))[_whole(used)]
-                for v, used, f in zip(values, r.used, self.autoregression, strict=True)
-            ]
-        )
+        return np.concatenate([f(v, used)[used] for v, used, f in zip(values, r.used, self.whitening, strict=True)])
 
-    def stretches(self, whitened: bool) -> np.ndarray:
+    @cached_property
+    def stretches(self) -> np.ndarray:
         """Number (N,) of the stretch of every row that counts, all logs after each other."""
-
-        def of(r: TorqueRows) -> list[np.ndarray]:
-            if whitened:
-                return [r.stretch[LAGS:][_whole(used)] for used in r.used]
-            return [r.stretch[used] for used in r.used]
-
-        return np.concatenate([np.concatenate(of(r)) + k * STRETCHES for k, r in enumerate(self.rows)])
+        return np.concatenate(
+            [np.concatenate([r.stretch[used] for used in r.used]) + k * STRETCHES for k, r in enumerate(self.rows)]
+        )
 
     def whiten_all(self, values: Sequence[np.ndarray]) -> np.ndarray:
         """Innovations (N, ...) of values (n_rows, n, ...) of each log."""
@@ -145,7 +219,7 @@ class TorqueFit:
         return self.whiten_all([r.W[:, :, self.kept] for r in self.rows])
 
     @cached_property
-    def _whitened_torques(self) -> np.ndarray:
+    def whitened_torques(self) -> np.ndarray:
         return self.whiten_all([r.Y for r in self.rows])
 
     def _whitened_design(self, like: TorqueFit) -> np.ndarray:
@@ -156,17 +230,22 @@ class TorqueFit:
     @cached_property
     def whitened_x(self) -> np.ndarray:
         """Coefficients (k,) of whitened rows."""
-        return solve(triangle(np.column_stack([self._whitened_design(self), self._whitened_torques])))
+        return solve(triangle(np.column_stack([self._whitened_design(self), self.whitened_torques])))
 
     @cached_property
     def innovations(self) -> np.ndarray:
         """Whitened residuals (N,)."""
-        return self._whitened_torques - self._whitened_design(self) @ self.whitened_x
+        return self.whitened_torques - self._whitened_design(self) @ self.whitened_x
 
     @cached_property
     def basis(self) -> np.ndarray:
         """Orthonormal basis (N, k) of the whitened columns."""
-        return np.linalg.qr(normalise(self._whitened_design(self)))[0]
+        return np.linalg.qr(normalise(self.whitened_design))[0]
+
+    @cached_property
+    def whitened_design(self) -> np.ndarray:
+        """Whitened columns (N, k) of parameters and terms."""
+        return self._whitened_design(self)
 
     @cached_property
     def covariance(self) -> np.ndarray:
@@ -176,7 +255,7 @@ class TorqueFit:
             own = [t.columns[k] if t.by_magnitude is None else t.by_magnitude[k] for t in self.terms]
             shapes = [t.slopes[k] * self.x[self.columns_of(t)][0] for t in self.terms]
             slopes.append(np.concatenate([r.W[:, :, self.kept], *own, *shapes], axis=2))
-        A, e, stretch = self.weight_all(slopes), self.weight_all(self.residual), self.stretches(False)
+        A, e, stretch = self.weight_all(slopes), self.weight_all(self.residual), self.stretches
         size = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
         A = A / size
         bread = np.linalg.pinv(A.T @ A, hermitian=True)
@@ -215,13 +294,11 @@ class TorqueFit:
         return self._predicted[like]
 
     def _hold_out(self, like: TorqueFit) -> tuple[np.ndarray, HoldOutErrors]:
-        A = np.column_stack([self._whitened_design(like), like._whitened_torques])
+        A = np.column_stack([self._whitened_design(like), like.whitened_torques])
         V = np.column_stack([self.weight_all(self.design), self.weight_all([r.Y for r in self.rows])])
-        group, plain = self.stretches(True), self.stretches(False)
-        parts = [
-            [triangle(M[number % FOLDS == turn]) for turn in range(FOLDS)] for M, number in ((A, group), (V, plain))
-        ]
-        names = np.unique(plain)
+        group = self.stretches
+        parts = [[triangle(M[group % FOLDS == turn]) for turn in range(FOLDS)] for M in (A, V)]
+        names = np.unique(group)
         likelihood = np.zeros(len(names))
         n_rows = len(self.level)
         squares, counts, motion = (np.zeros((len(names), n_rows)) for _ in range(3))
@@ -265,14 +342,3 @@ def solve(rows: np.ndarray) -> np.ndarray:
 
 def normalise(A: np.ndarray) -> np.ndarray:
     return np.asarray(A / np.maximum(np.linalg.norm(A, axis=0), 1e-300))
-
-
-def _lagged(v: np.ndarray) -> np.ndarray:
-    """Return every value with those before it, (n - lags, lags + 1, ...) from (n, ...)."""
-    p = LAGS
-    return np.stack([v[p - k : len(v) - k] for k in range(p + 1)], axis=1)
-
-
-def _whole(used: np.ndarray) -> np.ndarray:
-    """Find the rows that count, as do the LAGS rows before them: (n - lags,) from (n,)."""
-    return np.asarray(_lagged(used).all(axis=1))

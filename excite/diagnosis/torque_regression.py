@@ -23,19 +23,19 @@ from excite.diagnosis.curves import Curve, find_curves
 from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.diagnosis import FORMULA_STD_SHARE, MIN_EXPLAINED_SHARE, Finding, NearestEffect, ParameterChange
 from excite.diagnosis.hold_out import HoldOutErrors, torque_names
-from excite.diagnosis.score_test import Candidate
-from excite.diagnosis.selection import ProgressCallback, identified_entry
+from excite.diagnosis.selection import ProgressCallback
 from excite.diagnosis.torque_fit import LAGS, Term, TorqueFit
 from excite.diagnosis.torque_rows import TorqueRows, torque_rows
-from excite.diagnosis.torque_search import SETTINGS, Search, reason_against, scaled_magnitude
+from excite.diagnosis.torque_search import Search, scaled_magnitude
 from excite.errors import NotIdentifiableError
 from excite.identification import Solution
 from excite.logs import Log
 from excite.model import Model
-from excite.model.machine import EffectEntry, Filter
+from excite.model.machine import Filter
 from excite.text import format_number
 
 MIN_ROWS = 60  # in motion, of a joint; chosen
+NOISE_RATIO = 1.3  # size of what is left, over the sensors' noise, up to which nothing is; chosen
 MIN_LEVEL = 1e-6  # smallest noise of a row, of the torques' size; chosen
 
 
@@ -87,10 +87,15 @@ class TorqueDiagnosis:
         ]
 
 
+def by_torques(model: Model) -> bool:
+    """Tell if all joints are driven and rigid, so that torques along the measured motion tell what a model lacks."""
+    return model.fully_driven and model.plain and not model.known
+
+
 def _explains(fit: TorqueFit) -> bool:
     """Tell if a fit leaves no more than the sensors' noise."""
     rows = list(fit.model.actuated)
-    return bool((fit.level[rows] <= SETTINGS.noise_ratio * fit.lowest[rows]).all())
+    return bool((fit.level[rows] <= NOISE_RATIO * fit.lowest[rows]).all())
 
 
 def diagnose_torques(
@@ -173,38 +178,22 @@ def _finding(search: Search, fit: TorqueFit, term: Term, share: float, kind: str
     shapes = {
         n: (placed.values[n], abs(placed.values[n]) * relative.get(n, 0.0), placed.shape_unit(n)) for n in placed.shapes
     }
-    k = 1 + len(relative)
+    certainty = (c / std) ** 2
     return Finding(
         placed.effect.name,
         placed.where,
-        _rivals(search, fit, term),
-        float(min(1.0, len(search.names) * scipy.stats.chi2.sf(term.chi2, k))),
+        search.rivals(fit, term),
+        float(min(1.0, len(search.names) * scipy.stats.chi2.sf(certainty, 1 + len(relative)))),
         float(magnitude),
         size,
         placed.unit,
         shapes,
-        term.chi2,
+        certainty,
         share,
         kind,
         size,
         placed.file_value(search.model.machine),
     )
-
-
-def _rivals(search: Search, fit: TorqueFit, term: Term) -> tuple[EffectEntry, ...]:
-    """Return effects that explain the torques about as well as a term does beside the others."""
-    rest = fit.without(term)
-    own = search.test(rest, [Candidate(term.effect, (0,))], term.columns)[0]
-    found = []
-    for x in search.finalists(rest):
-        placed = x.candidate.placed
-        if placed.name != term.name and x.log_odds > own.log_odds - np.log(SETTINGS.tie_odds):
-            new = rest.with_terms([*rest.terms, search.term(x)])
-            if not reason_against(rest, new, new.terms[-1]):
-                values = {n: placed.values[n] for n in placed.shapes}
-                magnitude = scaled_magnitude(placed, x.coefficient)
-                found.append(identified_entry(placed.effect.name, placed.where, magnitude, values))
-    return tuple(found)
 
 
 def _what_is_left(fit: TorqueFit) -> list[str]:
@@ -216,5 +205,5 @@ def _what_is_left(fit: TorqueFit) -> list[str]:
         f"{names[k][0]}: {format_number(fit.level[rows[k]], 3)} {names[k][1]} are left, {format_number(ratio[k], 2)}"
         " times its noise"
         for k in np.argsort(-ratio)
-        if ratio[k] > SETTINGS.noise_ratio
+        if ratio[k] > NOISE_RATIO
     ]

@@ -1,93 +1,37 @@
-"""Choose effects that explain torques: score tests, Bayesian information, and predictions of withheld stretches."""
+"""Choose effects that explain torques: by evidence beside curves that mean nothing, and by withheld stretches."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import scipy.stats
 
 from excite import identification
-from excite.diagnosis import score_test
+from excite.diagnosis import evidence, score_test, selection
 from excite.diagnosis.deadline import Deadline
+from excite.diagnosis.evidence import Form
+from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.score_test import Candidate
 from excite.diagnosis.selection import ProgressCallback
 from excite.diagnosis.torque_fit import Term, TorqueFit
 from excite.diagnosis.torque_rows import TorqueRows, effect_columns, needed_torques
 from excite.model import Model
 from excite.model.effects import Effect, PlacedEffect
-from excite.model.machine import Filter
+from excite.model.machine import EffectEntry, Filter
+from excite.smoothing import build_basis
 
-
-@dataclass(frozen=True)
-class Settings:
-    """The numbers of the regression; all are chosen, and `min_odds` decides about false names.
-
-    min_odds: posterior odds from which an effect is tried, with even odds that there is one.
-    tie_odds: odds against the best below which a rival stays. min_stds: of an effect's size over its standard
-    deviation. min_share: of the misfit of its joint that an effect takes. max_effects: that are added. finalists:
-    candidates whose shapes are refined in a turn. noise_ratio: size of what is left, over the sensors' noise, up to
-    which nothing is.
-    """
-
-    min_odds: float = 20.0
-    tie_odds: float = 20.0
-    min_stds: float = 2.0
-    min_share: float = 0.02
-    max_effects: int = 10
-    finalists: int = 5
-    noise_ratio: float = 1.3
-
-
-SETTINGS = Settings()
-REACHES = 1.0, 0.35, 0.12  # shares of the way between trial values of shapes at which they are refined in turn; chosen
+MIN_ODDS = 3.0  # of an effect over curves that mean nothing, given the number of names; chosen
+MIN_STDS = 2.0  # of an effect's size over its standard deviation; chosen
+MIN_SHARE = 0.02  # of the misfit of its joint that an effect takes; chosen
+MAX_TURNS = 10  # of choosing and fitting again; chosen
+TYPICAL_SHARE = 0.1  # of a torque's root mean square, about which the sizes of curves are sought; chosen
 SHAPE_STEP = 0.03  # relative step of the slope by a shape; chosen
 SHORT_DELAYS = 2.0, 8.0  # samples; trial values of delays and lags; chosen
-MAX_SETTLING = 12  # passes to the magnitude of an effect that is not proportional to it; chosen
-STEPS = 0.3, 3.0  # factors on that magnitude in a pass at least and at most; chosen
-SETTLED = 0.02  # logarithm of the coefficient that ends them; chosen
+NEARBY_OCTAVES = 1.0, 0.3, 0.09, 0.03  # to both sides of a magnitude to which an effect is not proportional; chosen
+MAGNITUDES = 9  # that are tried there; chosen
 MIN_UNABSORBED_SHARE = 1e-4  # share of a column below which the parameters absorb it; chosen
-
-
-@dataclass(frozen=True)
-class Tested:
-    """A candidate beside a fit: chi-squared of the score test, coefficient, and log odds for it."""
-
-    candidate: Candidate
-    chi2: float
-    coefficient: float
-    log_odds: float
-
-
-def score_columns(fit: TorqueFit, columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return chi-squared (C,) and coefficients (C,) of columns (n_rows, n, C) added to a fit one at a time.
-
-    Zero for a column that the parameters absorb. The variance of a score is the larger one of white innovations and of
-    the scatter from stretch to stretch, in whose t distribution chi-squared is expressed.
-    """
-    C = fit.whiten_all(columns)
-    size = np.maximum(np.linalg.norm(C, axis=0), 1e-300)
-    C = C / size
-    C -= fit.basis @ (fit.basis.T @ C)
-    information = (C**2).sum(axis=0)
-    shown = information > MIN_UNABSORBED_SHARE
-    e, stretch = fit.innovations, fit.stretches(True)
-    step = np.where(shown, C.T @ e / np.where(shown, information, 1.0), 0.0)
-    variance = float(e @ e) / max(len(e) - fit.basis.shape[1], 1)
-    names = np.unique(stretch)
-    scores = np.array([C[stretch == c].T @ e[stretch == c] - step * (C[stretch == c] ** 2).sum(axis=0) for c in names])
-    scatter = (scores**2).sum(axis=0) * len(names) / max(len(names) - 1, 1)
-    white = step**2 * information / variance
-    t = step**2 * information**2 / np.maximum(scatter, 1e-300)
-    equal = scipy.stats.chi2.isf(np.maximum(scipy.stats.f.sf(t, 1, len(names) - 1), 1e-300), 1)
-    return np.where(shown, np.minimum(white, equal), 0.0), step / size
-
-
-def log_odds(chi2: float, term: PlacedEffect, n: int, n_candidates: int) -> float:
-    """Log odds for an effect by its Bayesian information: n rows, candidates that are all as likely before."""
-    k = 1 + len(free_shapes(term))
-    return 0.5 * chi2 - 0.5 * k * np.log(n) - np.log(n_candidates)
 
 
 def free_shapes(term: PlacedEffect) -> list[str]:
@@ -112,174 +56,218 @@ def _is_impossible(e: PlacedEffect, coefficient: float) -> bool:
     return bool(has_wrong_sign or abs(size) > e.effect.largest)
 
 
-def _is_seen_in_torques(e: PlacedEffect) -> bool:
-    """Tell if an effect changes the torques of moving joints, or what they seem to need: not near rest alone."""
-    return e.effect.shaking is None and not e.unsticking
-
-
 def _phase(e: PlacedEffect) -> str | None:
     """Return the shape that is a phase, None if there is none."""
     return next((n for n, shape in e.shapes.items() if shape.circular), None)
 
 
-def _in_quadrature(x: Candidate) -> list[Candidate]:
-    """Return a candidate at two phases a quarter of a turn apart, one without a phase as it is."""
-    phase = _phase(x.placed)
-    if phase is None:
-        return [x]
-    both = (replace(x.placed, values={**x.placed.values, phase: at}) for at in (0.0, np.pi / 2))
-    return [Candidate(placed, (0,)) for placed in both]
-
-
 class Search:
     """Adds effects to a fit as long as one is worth it."""
 
-    def __init__(self, model: Model, rows: Sequence[TorqueRows], filter: Filter, X: np.ndarray) -> None:
-        self.model, self.rows, self.filter, self.X = model, rows, filter, X
+    def __init__(
+        self,
+        model: Model,
+        rows: Sequence[TorqueRows],
+        filter: Filter,
+        X: np.ndarray,
+        runner: CallRunner = run_in_turn,
+    ) -> None:
+        self.model, self.rows, self.filter, self.X, self.runner = model, rows, filter, X, runner
         self.torques = [needed_torques(model, r, X) for r in rows]
         self.duration = max(float(r.t[-1]) for r in rows)
         # trial values of the machine at the speeds of the logs, whatever rate its file gives for the friction's turn
         self.machine = identification.with_soft_friction(model, [r.log for r in rows], filter).machine
         found = score_test.candidates(self.machine, [s.name for s in self.machine.sensors("full")], self.duration)
-        self.candidates = [y for x in found if _is_seen_in_torques(x.placed) for y in _in_quadrature(x)]
-        self.candidates += self._short_delays()
-        self.names = sorted({x.name for x in self.candidates})
-        self.columns = self._columns([x.placed for x in self.candidates])
+        # what shows in the torques of moving joints, or in what they seem to need: not near rest alone
+        found = [x for x in found if x.placed.effect.shaking is None and not x.placed.unsticking]
+        self.candidates = score_test.renumber_columns([*found, *self._short_delays(found)])
+        self.candidate_columns = self._columns(self.candidates)
+        self.curves, self.group, self.groups = self._curves()
 
-    def _columns(self, placed: Sequence[PlacedEffect]) -> list[np.ndarray]:
-        return effect_columns(self.model, self.rows, self.torques, placed, self.X, self.filter)
+    @property
+    def names(self) -> set[str]:
+        """Names of all candidates."""
+        return {x.name for x in self.candidates}
 
-    def _short_delays(self) -> list[Candidate]:
+    def _short_delays(self, found: Sequence[Candidate]) -> list[Candidate]:
         """Return delays and lags of a few samples, beside the trials that are as long as hydraulics are slow."""
         sample = 1 / float(self.machine.sampling_hz)
-        seen = {x.name: x for x in self.candidates if x.placed.effect.unit == "s" and not x.placed.effect.timed}
+        seen = {x.name: x for x in found if x.placed.effect.unit == "s" and not x.placed.effect.timed}
         return [
             replace(x, placed=replace(x.placed, values={**x.placed.values, "A": times * sample}))
             for x in seen.values()
             for times in SHORT_DELAYS
         ]
 
-    def settle(self, fit: TorqueFit, x: Tested) -> Tested | None:
-        """Return a candidate with the magnitude at which its coefficient is 1, None if there is none.
+    def _columns(self, found: Sequence[Candidate]) -> list[np.ndarray]:
+        """Return the columns (n_rows, n, C) of candidates along each log, two for one with a phase."""
+        placed: list[PlacedEffect] = []
+        for x in found:
+            phase = _phase(x.placed)
+            for turn in range(len(x.columns)):
+                shift = {} if phase is None else {phase: x.placed.values[phase] + turn * np.pi / 2}
+                placed.append(replace(x.placed, values={**x.placed.values, **shift}))
+        return self._columns_of(placed)
 
-        The torque of a delay is not proportional to it: only there is the column that of the magnitude.
+    def _columns_of(self, placed: Sequence[PlacedEffect]) -> list[np.ndarray]:
+        return effect_columns(self.model, self.rows, self.torques, placed, self.X, self.filter)
+
+    def _curves(self) -> tuple[list[np.ndarray], np.ndarray, tuple[str, ...]]:
+        """Return what the model may lack without a name: columns (n_rows, n, G), group (G,) of each, and groups."""
+        rows, at = self.rows, list(self.model.actuated)
+        basis = build_basis(
+            [r.nu[r.at][:, at] for r in rows], [r.q[r.at][:, at] for r in rows], [r.t[r.at] for r in rows], len(at)
+        )
+        size = TYPICAL_SHARE * np.sqrt(np.mean(np.concatenate([r.Y[at] ** 2 for r in rows], axis=1), axis=1))
+        found = []
+        for k, r in enumerate(rows):
+            columns = np.zeros((*r.Y.shape, basis.root.shape[1]))
+            for j, row in enumerate(at):
+                weights = basis.rows(j, k, r.nu[r.at, row], r.q[r.at, row], r.t[r.at])
+                own = slice(int(basis.start[j]), int(basis.start[j]) + basis.count[j])
+                columns[row] = size[j] * (weights @ basis.root[own])
+            found.append(columns)
+        group = np.zeros(basis.root.shape[1], int)
+        for k, one in enumerate(basis.components):
+            group[one.columns] = k
+        return found, group, tuple(f"{one.kind} {one.channel}" for one in basis.components)
+
+    def form(self, fit: TorqueFit, found: Sequence[Candidate] | None = None) -> Form:
+        """Return the form of parameters and a fit's effects, of curves, and of candidates, all by default."""
+        found = self.candidates if found is None else score_test.renumber_columns(found)
+        columns = self.candidate_columns if found is self.candidates else self._columns(found)
+        Z = np.concatenate([fit.whitened_design, *(fit.whiten_all(x) for x in (self.curves, columns))], axis=1)
+        o, first = fit.whitened_design.shape[1], fit.whitened_design.shape[1] + len(self.group)
+        Z[:, :o] /= np.maximum(np.linalg.norm(Z[:, :o], axis=0), 1e-300)
+        A, b = Z.T @ Z, Z.T @ fit.whitened_torques
+        left = Z[:, first:] - fit.basis @ (fit.basis.T @ Z[:, first:])
+        square = (left**2).sum(axis=0)
+        absorbed = np.flatnonzero(square < MIN_UNABSORBED_SHARE * np.diag(A)[first:])
+        likeliest = np.abs(left.T @ fit.innovations) / np.maximum(square, 1e-300)
+        likeliest[absorbed], absorbed = 0.0, absorbed + first
+        A[absorbed], A[:, absorbed], b[absorbed] = 0.0, 0.0, 0.0
+        std = [evidence.amount_std(self.machine, x.placed, self.duration) for x in found for _ in x.columns]
+        # a prior with heavy tails: what is larger than usual costs no more than its width
+        return Form(A, b, o, self.group, self.groups, tuple(found), np.maximum(std, likeliest))
+
+    def settle(self, fit: TorqueFit, x: Candidate, factor: np.ndarray) -> PlacedEffect | None:
+        """Return a candidate with the magnitude and the phase that its factors stand for; None if of a wrong sign.
+
+        The torque of a delay is not proportional to it: the likeliest one is that with the factor 1.
         """
-        if is_proportional(x.candidate.placed.effect):
-            return x
-        for _ in range(MAX_SETTLING):
-            if not x.coefficient > 0:
-                return None
-            if abs(np.log(x.coefficient)) < SETTLED:
-                return x
-            placed = x.candidate.placed
-            value = scaled_magnitude(placed, float(np.clip(x.coefficient, *STEPS)))
-            moved = replace(x.candidate, placed=replace(placed, values={**placed.values, "A": value}))
-            (x,) = self.test(fit, [moved], self._columns([moved.placed]))
-        return None
+        placed = x.placed
+        if len(factor) == 2:
+            turned = placed.values[_phase(placed) or ""] + float(np.arctan2(factor[1], factor[0]))
+            placed = replace(placed, values={**placed.values, _phase(placed) or "": turned})
+            factor = np.array([np.hypot(*factor)])
+        if is_proportional(placed.effect):
+            return replace(placed, values={**placed.values, "A": scaled_magnitude(placed, float(factor[0]))})
+        if not factor[0] > 0:
+            return None
+        for octaves in NEARBY_OCTAVES:
+            amounts = placed.values["A"] * 2 ** (octaves * np.linspace(-1, 1, MAGNITUDES))
+            tried = [replace(placed, values={**placed.values, "A": float(x)}) for x in amounts]
+            form = self.form(fit, [Candidate(x, (0,)) for x in tried]).reduced()
+            at = np.arange(len(self.group), len(form.right_side))
+            placed = tried[int(np.argmax(2 * form.right_side[at] - np.diag(form.information)[at]))]
+        return placed
 
-    def test(self, fit: TorqueFit, candidates: Sequence[Candidate], columns: Sequence[np.ndarray]) -> list[Tested]:
-        """Test candidates beside a fit, the likeliest first; a coefficient of impossible sign counts for nothing."""
-        chi2, step = score_columns(fit, columns)
-        n, found = len(fit.innovations), []
-        for x, c, a in zip(candidates, chi2, step, strict=True):
-            c = 0.0 if _is_impossible(x.placed, a) else float(c)
-            found.append(Tested(x, c, float(a), log_odds(c, x.placed, n, len(self.names))))
-        return sorted(found, key=lambda x: -x.log_odds)
-
-    def turn_phase(self, fit: TorqueFit, x: Tested) -> Tested:
-        """Return a candidate with the phase that explains most, one without a phase as it is."""
-        phase = _phase(x.candidate.placed)
-        if phase is None:
-            return x
-        both = _in_quadrature(x.candidate)
-        C = fit.whiten_all(self._columns([y.placed for y in both]))
-        C -= fit.basis @ (fit.basis.T @ C)
-        sine, cosine = np.linalg.lstsq(C, fit.innovations, rcond=None)[0]
-        values = {**x.candidate.placed.values, phase: float(np.arctan2(cosine, sine))}
-        turned = replace(both[0], placed=replace(both[0].placed, values=values))
-        (other,) = self.test(fit, [turned], self._columns([turned.placed]))
-        return other if other.chi2 > x.chi2 else x
-
-    def finalists(self, fit: TorqueFit) -> list[Tested]:
-        """Return the likeliest candidate of each name, with refined shapes, the likeliest first."""
-        taken = {t.name for t in fit.terms}
-        best: dict[str, Tested] = {}
-        for x in self.test(fit, self.candidates, self.columns):
-            if x.candidate.name not in taken:
-                best.setdefault(x.candidate.name, x)
-        chosen = [self.turn_phase(fit, x) for x in best.values() if x.log_odds > 0][: SETTINGS.finalists]
-        for reach in REACHES:
-            near = score_test.refine_candidates([x.candidate for x in chosen], self.machine, self.duration, reach)
-            near = [x for x in near if len(x.columns) == 1]
-            if near:
-                for x in self.test(fit, near, self._columns([x.placed for x in near])):
-                    chosen = [x if y.candidate.name == x.candidate.name and x.chi2 > y.chi2 else y for y in chosen]
-        settled = [self.settle(fit, x) for x in chosen]
-        return sorted((x for x in settled if x is not None), key=lambda x: -x.log_odds)
-
-    def term(self, x: Tested) -> Term:
-        """Return a candidate as columns, with slopes by its shapes."""
-        placed = x.candidate.placed
+    def term(self, placed: PlacedEffect) -> Term:
+        """Return an effect as columns, with slopes by its shapes."""
         free = free_shapes(placed)
         moved = [
             replace(placed, values={**placed.values, n: placed.values[n] * (1 + sign * SHAPE_STEP)})
             for n in [*free, "A"]
             for sign in (1, -1)
         ]
-        columns = self._columns([placed, *moved])
+        columns = self._columns_of([placed, *moved])
         slopes = [(c[:, :, 1::2] - c[:, :, 2::2]) / (2 * SHAPE_STEP) for c in columns]
         sign = -1.0 if placed.effect.inverse else 1.0
         by_magnitude = None if is_proportional(placed.effect) else [sign * s[:, :, -1:] for s in slopes]
-        shapes = [s[:, :, :-1] for s in slopes]
-        return Term(placed, [c[:, :, :1] for c in columns], shapes, tuple(free), by_magnitude, x.chi2)
+        return Term(placed, [c[:, :, :1] for c in columns], [s[:, :, :-1] for s in slopes], tuple(free), by_magnitude)
+
+    def refined(self, fit: TorqueFit, found: evidence.Chosen) -> list[Term]:
+        """Return chosen candidates as terms, with refined shapes."""
+        stage = selection.Scored(self.machine, self.duration, lambda own, runner: self.form(fit, own))
+        found = selection.refined(stage, found, self.runner)
+        settled = [self.settle(fit, x, f) for x, f in zip(found.candidates, found.factors, strict=True)]
+        return [self.term(x) for x in settled if x is not None]
 
     def extend(self, fit: TorqueFit, report: ProgressCallback, deadline: Deadline) -> tuple[TorqueFit, list[str]]:
-        """Add the likeliest effect that holds, and drop those that do not beside it, until none holds or time is over.
+        """Add the likeliest effects that hold, and drop those that do not, until none holds or time is over.
 
         Return the last fit, and why effects that were likely were not added.
         """
         reasons: dict[str, str] = {}
         tried = {frozenset[str]()}
-        while len(fit.terms) < SETTINGS.max_effects and not deadline.is_over():
-            report(0.2 + 0.6 * len(fit.terms) / SETTINGS.max_effects, "testing effects on the torques")
-            added = None
-            for x in self.finalists(fit):
-                if x.log_odds < np.log(SETTINGS.min_odds):
-                    break
-                term = self.term(x)
-                new = fit.with_terms([*fit.terms, term])
-                why = reason_against(fit, new, term)
-                if not why:
-                    added = new
-                    break
-                reasons[term.name] = why
-            if added is None:
+        for turn in range(MAX_TURNS):
+            if deadline.is_over():
                 break
-            held = [t for t in added.terms if t is added.terms[-1] or _is_certain(added, t)]
-            fit = added if len(held) == len(added.terms) else added.with_terms(held)
-            names = frozenset(t.name for t in fit.terms)
+            report(0.2 + 0.6 * turn / MAX_TURNS, "testing effects on the torques")
+            form, known = self.form(fit), {t.name for t in fit.terms}
+            rest = [x for x in form.candidates if x.name not in known and x.name not in reasons]
+            chosen = evidence.choose(replace(form, candidates=tuple(rest)), odds=MIN_ODDS)
+            if not chosen.candidates:
+                break
+            new = fit.with_terms([*fit.terms, *self.refined(fit, chosen)])
+            new = self._that_hold(new, reasons)
+            names = frozenset(t.name for t in new.terms)
             if names in tried:  # effects that replace each other in turn
                 break
             tried.add(names)
+            fit = new
         found = {t.name for t in fit.terms}
         return fit, [f"{name}: {why}" for name, why in reasons.items() if name not in found]
 
+    def _that_hold(self, fit: TorqueFit, reasons: dict[str, str]) -> TorqueFit:
+        """Return a fit without the effects that do not hold beside the others, the last ones first."""
+        for term in reversed(fit.terms):
+            rest = fit.without(term)
+            why = reason_against(rest, fit, term)
+            if why:
+                reasons[term.name] = why
+                fit = rest
+        return fit
 
-def _is_certain(fit: TorqueFit, term: Term) -> bool:
-    x, std = fit.coefficient(term)
-    return abs(x) > SETTINGS.min_stds * std
+    def gain(self, rest: TorqueFit, placed: PlacedEffect) -> float:
+        """Return the gain of an effect beside a fit: twice the logarithm of a Bayes factor."""
+        form = self.form(rest, [Candidate(placed, (0,))]).reduced()
+        return evidence.posterior(form, form.candidates, form.nothing, 0).gain
+
+    def rivals(self, fit: TorqueFit, term: Term) -> tuple[EffectEntry, ...]:
+        """Return effects that explain the torques about as well as a term does beside the others."""
+        rest = fit.without(term)
+        own = self.gain(rest, term.effect)
+        margin = 2 * np.log(evidence.CREDIBLE_ODDS) + selection.formula_ratio(own)
+        form = self.form(rest).reduced()
+        gains = evidence.first_gains(form, (), form.nothing)
+        known = {t.name for t in fit.terms}
+        best = [form.candidates[k] for k in evidence.best_of_each(form, gains, lambda x: x.name, 0.0)]
+        found = []
+        for x in [x for x in best if x.name not in known][: selection.MAX_RIVALS]:
+            factor = evidence.posterior(form, [x], form.nothing, 0).factors(form, [x])[0]
+            for rival in self.refined(rest, evidence.Chosen((x,), (factor,), (), 0.0, tuple(np.exp(form.nothing)))):
+                if self.gain(rest, rival.effect) < own - margin:
+                    continue
+                new = rest.with_terms([*rest.terms, rival])
+                if not reason_against(rest, new, rival):
+                    placed, coefficient = rival.effect, new.coefficient(rival)[0]
+                    values = {n: placed.values[n] for n in placed.shapes}
+                    magnitude = scaled_magnitude(placed, coefficient)
+                    found.append(selection.identified_entry(placed.effect.name, placed.where, magnitude, values))
+        return tuple(found)
 
 
 def reason_against(before: TorqueFit, after: TorqueFit, term: Term) -> str:
     """Say why an effect does not hold, "" if it does."""
-    x = after.coefficient(term)[0]
-    if not _is_certain(after, term):
+    x, std = after.coefficient(term)
+    if not abs(x) > MIN_STDS * std:
         return "its size is uncertain"
     if _is_impossible(term.effect, x):
         return "its sign or its size is impossible"
     if not predicts_better(before, after):
         return "it does not predict withheld stretches better"
-    if share_of_row(before, after) < SETTINGS.min_share:
+    if share_of_row(before, after) < MIN_SHARE:
         return "it takes too little"
     return ""
 

@@ -1,4 +1,5 @@
 from .cramer_rao import cramer_rao as cramer_rao
+from .discrepancy import build_basis as build_basis
 from .forward import (
     interpolate as interpolate,
     state_scale as state_scale,
