@@ -78,6 +78,18 @@ class Form:
             self, information=self.information[np.ix_(keep, keep)], right_side=right_side, outer=self.outer - len(at)
         )
 
+    def without_groups(self) -> Form:
+        """Return the form without unknown forces."""
+        n = len(self.group)
+        keep = np.r_[: self.outer, self.outer + n : len(self.right_side)]
+        return replace(
+            self,
+            information=self.information[np.ix_(keep, keep)],
+            right_side=self.right_side[keep],
+            group=self.group[:0],
+            names=(),
+        )
+
     @property
     def nothing(self) -> np.ndarray:
         """Logarithms of sizes (groups,) with which there are no unknown forces."""
@@ -156,9 +168,15 @@ def posterior(
 
     def solve(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
         size = np.r_[np.exp(logs)[form.group], fixed]
+        if not len(size):
+            return size, size, 0.0, size
         whole = size[:, None] * information * size
         whole[range(len(size)), range(len(size))] += 1
-        root, pull = lapack.dpotrf(whole, lower=1)[0], size * right_side
+        root, fault = lapack.dpotrf(whole, lower=1)
+        if fault:  # eliminations leave rounding errors
+            values, axes = np.linalg.eigh(whole)
+            root = np.linalg.cholesky((axes * np.maximum(values, 1.0)) @ axes.T)
+        pull = size * right_side
         mean = lapack.dpotrs(root, pull, lower=1)[0]
         variance = np.diag(lapack.dpotri(root, lower=1)[0])
         return mean, variance, float(pull @ mean - 2 * np.log(np.diag(root)).sum()), size

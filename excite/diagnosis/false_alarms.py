@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from excite import interrupt
@@ -14,8 +16,9 @@ from excite.diagnosis.diagnosis import Diagnosis
 from excite.diagnosis.findings import explain
 from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.selection import ProgressCallback
+from excite.diagnosis.torque_regression import TorqueDiagnosis, names_in_clean_torques
 from excite.errors import NoEstimateError, NotIdentifiableError, SimulationError
-from excite.model import build
+from excite.model import Model, build
 from excite.text import count
 
 FIRST_SEED = 100  # of the simulated logs, apart from those that measure the remainder; chosen
@@ -66,7 +69,7 @@ class FalseAlarms:
 
 
 def count_false_alarms(
-    d: Diagnosis,
+    d: Diagnosis | TorqueDiagnosis,
     runs: int,
     progress: ProgressCallback | None = None,
     runner: CallRunner = run_in_turn,
@@ -77,11 +80,15 @@ def count_false_alarms(
     budget_s [s]: no log is begun after it, None for no end. A first Ctrl-C ends the count with the logs diagnosed so
     far. Raises NotIdentifiableError if no machine follows the logs with exact dynamics.
     """
-    if not can_be_simulated(d.after):
-        raise NotIdentifiableError("no false alarms were counted: no model follows the logs that could be simulated")
+    if isinstance(d, TorqueDiagnosis):
+        diagnosed: Callable[[int], tuple[str, list[str]] | None] = partial(_of_torques, d)
+    else:
+        if not can_be_simulated(d.after):
+            raise NotIdentifiableError(
+                "no false alarms were counted: no model follows the logs that could be simulated"
+            )
+        diagnosed = partial(_of_motion, d, build(selection.fitted_machine(d.after)), runner)
     report = progress or (lambda share, what: None)
-    machine = selection.fitted_machine(d.after)
-    model = build(machine)
     verdicts, names, failed = Counter[str](), Counter[str](), 0
     with interrupt.note_first_interrupt() as asked:
         deadline = Deadline(budget_s, lambda: asked.stop)
@@ -89,16 +96,29 @@ def count_false_alarms(
             if deadline.is_over():
                 break
             report(k / runs, f"diagnosing clean log {k + 1} of {runs}")
-            try:
-                logs, _ = simulate_clean(d.after, FIRST_SEED + k)
-                found = explain(model, logs, machine.filter, runner=runner).diagnosis
-            except (NoEstimateError, SimulationError):
-                found = None
+            found = diagnosed(FIRST_SEED + k)
             if asked.stop:
                 break
             if found is None:
                 failed += 1
                 continue
-            verdicts[found.verdict] += 1
-            names.update(f.name for f in found.findings if f.kind == "cause")
+            verdict, own = found
+            verdicts[verdict] += 1
+            names.update(own)
     return FalseAlarms(dict(verdicts), failed, dict(names))
+
+
+def _of_motion(d: Diagnosis, model: Model, runner: CallRunner, seed: int) -> tuple[str, list[str]] | None:
+    """Return verdict and names of a clean simulated log, None without an answer."""
+    try:
+        logs, _ = simulate_clean(d.after, seed)
+        found = explain(model, logs, model.machine.filter, runner=runner).diagnosis
+    except (NoEstimateError, SimulationError):
+        return None
+    return found.verdict, [f.name for f in found.findings if f.kind == "cause"]
+
+
+def _of_torques(d: TorqueDiagnosis, seed: int) -> tuple[str, list[str]]:
+    """Return verdict and names of clean torques along the measured motion."""
+    names = names_in_clean_torques(d, seed)
+    return "named" if names else "clean", names

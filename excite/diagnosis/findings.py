@@ -24,6 +24,7 @@ from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.residuals import InnovationLevel
 from excite.diagnosis.selection import ProgressCallback
 from excite.diagnosis.torque_regression import TorqueDiagnosis
+from excite.errors import NoEstimateError
 from excite.identification import Agreement
 from excite.logs import Log
 from excite.model import Model
@@ -33,6 +34,7 @@ from excite.text import format_number, format_rounded, format_uncertain
 MACHINE_FILE_DIGITS = 8  # significant digits of magnitudes in a machine file; chosen
 FIRST_ANOMALY_LINES = 3  # lines about anomalies that precede all others; chosen
 MIN_NEAREST_SHARE = 0.05  # share of the misfit above which the nearest effect is mentioned; chosen
+MAX_FOLLOWED_JOINTS = 3  # driven joints of a machine without slips whose motion is followed in open loop; chosen
 DIAGNOSE_SHARE = 0.8  # of the progress; gains take the rest; chosen
 FULL_EXPLANATION_SHARE = 0.99  # share of the misfit below which the answer gives it; chosen
 
@@ -158,24 +160,14 @@ def explain(
 ) -> Assessment:
     """Diagnose logs by joint smoothing, or by regression on the torques where all joints are driven and rigid.
 
+    Where these torques are explained, joint smoothing says what shows near rest alone, if it can follow the motion.
     Several logs are compared first: if each alone is explained and they differ in parameters, that is the answer.
     budget_s [s]: after it, and after a first Ctrl-C, nothing new is begun, and the best answer so far is given. Raises
     NoEstimateError.
     """
     differences = _find_differences(model, logs, filter)
     if differences is not None:
-        together = diagnose(model, logs, filter, progress, runner, Deadline(0.0))
-        verdict = "named" if differences.explained else "unexplained"
-        plain = replace(
-            together,
-            verdict=verdict,
-            findings=(),
-            without=(),
-            after=together.before,
-            nearest=None,
-            located=(),
-        )
-        return replace(assess(plain, progress, runner), located=(), differences=differences)
+        return _of_differences(differences, model, logs, filter, progress, runner)
     with interrupt.note_first_interrupt() as asked:
         deadline = Deadline(budget_s, lambda: asked.stop)
         found = _explain(model, logs, filter, progress, runner, deadline)
@@ -185,10 +177,35 @@ def explain(
     return replace(found, cut_short=by)
 
 
+def _of_differences(
+    differences: Agreement,
+    model: Model,
+    logs: Sequence[Log],
+    filter: Filter,
+    progress: ProgressCallback | None,
+    runner: CallRunner,
+) -> Assessment:
+    """Give differences between logs as the answer, beside the model without any effect."""
+    verdict, now = "named" if differences.explained else "unexplained", Deadline(0.0)
+    if torque_regression.by_torques(model):
+        torques, errors = torque_regression.diagnose_torques(model, logs, filter, progress, now)
+        torques = replace(torques, verdict=verdict, findings=(), after=torques.before, located=())
+        return replace(assess_torques(torques, errors[:1]), differences=differences)
+    found = diagnose(model, logs, filter, progress, runner, now)
+    plain = replace(found, verdict=verdict, findings=(), without=(), after=found.before, nearest=None, located=())
+    return replace(assess(plain, progress, runner), located=(), differences=differences)
+
+
 def _find_differences(model: Model, logs: Sequence[Log], filter: Filter) -> Agreement | None:
     """Return what differs between several logs of which each alone is explained down to noise; None if nothing."""
-    if model.effects or torque_regression.by_torques(model):
+    if model.effects:
         return None
+    if torque_regression.by_torques(model):
+        groups = identification.group_by_file(logs)
+        alone = [torque_regression.estimate_if_explained(model, own, filter) for own in groups.values()]
+        every = [x for x in alone if x is not None]
+        agreement = identification.compare_logs(tuple(groups), every) if len(every) == len(groups) else None
+        return None if agreement is None or agreement.agree else agreement
     agreement, estimates = identification.compare_sources(model, logs, "joint", filter, explained=True)
     if agreement is None or agreement.agree or any(e.status != "valid" for e in estimates):
         return None
@@ -204,11 +221,24 @@ def _explain(
     deadline: Deadline,
 ) -> Assessment:
     """Diagnose as `explain` does."""
+    report = progress or (lambda share, what: None)
+    torques: Assessment | None = None
     if torque_regression.by_torques(model):
-        return assess_torques(*torque_regression.diagnose_torques(model, logs, filter, progress, deadline))
-    report, left = progress or (lambda share, what: None), 1 - DIAGNOSE_SHARE
-    found = diagnose(model, logs, filter, lambda share, what: report(DIAGNOSE_SHARE * share, what), runner, deadline)
-    return assess(found, lambda share, what: report(DIAGNOSE_SHARE + left * share, what), runner, deadline)
+        torques = assess_torques(*torque_regression.diagnose_torques(model, logs, filter, report, deadline))
+        followed = len(model.actuated) <= MAX_FOLLOWED_JOINTS
+        if torques.diagnosis.verdict != "clean" or not followed or deadline.is_over():
+            return torques
+    left = 1 - DIAGNOSE_SHARE
+    try:
+        found = diagnose(
+            model, logs, filter, lambda share, what: report(DIAGNOSE_SHARE * share, what), runner, deadline
+        )
+        every = assess(found, lambda share, what: report(DIAGNOSE_SHARE + left * share, what), runner, deadline)
+    except NoEstimateError:
+        if torques is None:
+            raise
+        return torques
+    return every if torques is None or every.diagnosis.verdict in ("named", "tied") else torques
 
 
 def assess_torques(d: TorqueDiagnosis, errors: Sequence[HoldOutErrors]) -> Assessment:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
 import scipy.linalg
+import scipy.signal
 
 from excite.diagnosis.hold_out import HoldOutErrors, torque_names
 from excite.diagnosis.torque_rows import STRETCHES, TorqueRows
@@ -76,6 +77,12 @@ class Whitening:
         white[~used] = 0.0
         return white.reshape(values.shape)
 
+    def simulate(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Return n rows of a course and white noise of this size."""
+        drive = np.sqrt((1 - self.share) * np.append(1.0, np.full(n - 1, 1 - self.stay**2))) * rng.standard_normal(n)
+        course = scipy.signal.lfilter([1.0], [1.0, -self.stay], drive)
+        return np.asarray(self.size * (course + np.sqrt(self.share) * rng.standard_normal(n)))
+
 
 def course_gains(used: np.ndarray, stay: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the variances of innovations and the gains (n, P) of a Kalman filter of a course beside white noise.
@@ -105,7 +112,7 @@ def innovations(
     """Return standardised innovations (n, C) of columns (n, C), zero where rows are not used."""
     known = np.where(used[:, None], values, 0.0)
     band = np.ones((2, len(values)))
-    band[1] = -stay * (1 - gain)
+    band[1, :-1] = -stay * (1 - gain[1:])
     mean = scipy.linalg.solve_banded((1, 0), band, stay * gain[:, None] * known, check_finite=False)
     before = np.concatenate([np.zeros((1, known.shape[1])), mean[:-1]])
     return np.asarray((known - before) * used[:, None] / np.sqrt(variance)[:, None])
@@ -197,6 +204,14 @@ class TorqueFit:
     def _whiten(self, values: np.ndarray, r: TorqueRows) -> np.ndarray:
         """Innovations of rows in motion, (n, ...) from (n_rows, n, ...)."""
         return np.concatenate([f(v, used)[used] for v, used, f in zip(values, r.used, self.whitening, strict=True)])
+
+    def simulated(self, rng: np.random.Generator) -> TorqueFit:
+        """Return the fit to clean torques: those of this fit with new noise of the kind that it leaves."""
+        rows = []
+        for r, A in zip(self.rows, self.design, strict=True):
+            noise = np.array([w.simulate(r.Y.shape[1], rng) for w in self.whitening])
+            rows.append(replace(r, Y=A @ self.x + noise))
+        return TorqueFit(self.model, rows, self.kept, self.lowest, self.terms)
 
     @cached_property
     def stretches(self) -> np.ndarray:

@@ -28,7 +28,7 @@ from excite.diagnosis.torque_fit import LAGS, Term, TorqueFit
 from excite.diagnosis.torque_rows import TorqueRows, torque_rows
 from excite.diagnosis.torque_search import Search, scaled_magnitude
 from excite.errors import NotIdentifiableError
-from excite.identification import Solution
+from excite.identification import Estimate, Solution
 from excite.logs import Log
 from excite.model import Model
 from excite.model.machine import Filter
@@ -55,6 +55,7 @@ class TorqueDiagnosis:
     located: tuple[str, ...]
     curves: tuple[Curve, ...]
     solution: Solution
+    filter: Filter
     rejected: tuple[str, ...] = ()
     nearest: NearestEffect | None = None
 
@@ -88,8 +89,12 @@ class TorqueDiagnosis:
 
 
 def by_torques(model: Model) -> bool:
-    """Tell if all joints are driven and rigid, so that torques along the measured motion tell what a model lacks."""
-    return model.fully_driven and model.plain and not model.known
+    """Tell if all joints are driven and rigid, so that torques along the measured motion tell what a model lacks.
+
+    Torques must be linear in the effects that the model has.
+    """
+    linear = not any(e.name in model.nonlinear or e.effect.sensor_only for e in model.effects)
+    return model.fully_driven and linear and not model.known
 
 
 def _explains(fit: TorqueFit) -> bool:
@@ -105,30 +110,26 @@ def diagnose_torques(
     report: ProgressCallback | None = None,
     deadline: Deadline | None = None,
 ) -> tuple[TorqueDiagnosis, list[HoldOutErrors]]:
-    """Diagnose the torques of a machine without slips and without effects.
+    """Diagnose the torques of a machine whose joints are all driven (`by_torques`).
 
     Return the errors on withheld stretches without findings, with the first, the first two, ... as well. Raises
     NotIdentifiableError.
     """
     report, deadline = report or (lambda share, what: None), deadline or Deadline()
     report(0.05, "fitting the torques")
-    rows = torque_rows(model, logs, filter)
-    _require_rows(model, rows)
-    blocks = [(r.W, r.Y) for r in rows]
-    errors = [identification.row_errors(model, x, filter, 1) for x in logs]
-    lowest = identification.row_levels(errors, model.nominal, [r.used for r in rows])
-    lowest = np.maximum(lowest, MIN_LEVEL * np.sqrt(np.mean(np.concatenate([r.Y**2 for r in rows], axis=1))))
-    solution = identification.solve_blocks(blocks, model.scale)
-    before = TorqueFit(model, rows, solution.kept, lowest, [])
-    search = Search(model, rows, filter, identification.fit_rows(model, blocks, solution))
-    after, reasons = search.extend(before, report, deadline)
+    before, solution = _fit_without_effects(model, logs, filter)
+    blocks = [(r.W, r.Y) for r in before.rows]
+    search = Search(model, before.rows, filter, identification.fit_rows(model, blocks, solution))
+    reasons = dict[str, str]()
+    after = search.extend(before, reasons, report, deadline)
+    if not _is_named(before, after):  # what a curve explains better may still take a part of it, as a correction
+        after = search.extend(after, reasons, report, deadline, curves=False)
     after = _largest_first(before, after)
     between = [before.with_terms(after.terms[:k]) for k in range(1, len(after.terms))]
     stages = [before, *between, after] if after.terms else [before]
     withheld = [stage.hold_out(before)[1] for stage in stages]
-    explained, total = _explains(after), _excess(before)
+    explained, named, total = _explains(after), _is_named(before, after), _excess(before)
     shares = [(_excess(a) - _excess(b)) / total if total > 0 else 1.0 for a, b in pairwise(stages)]
-    named = explained or (len(shares) == 1 and shares[0] >= MIN_EXPLAINED_SHARE)  # several would be a patchwork
     kind = "cause" if named else "correction"
     findings = [_finding(search, after, *each, kind) for each in zip(after.terms, shares, strict=True)]
     verdict = "unexplained"
@@ -138,10 +139,48 @@ def diagnose_torques(
     curves = [] if explained or deadline.is_over() else find_curves(after, search.torques, report)
     located = [] if explained else [*_what_is_left(after), *map(str, curves)]
     share = 1.0 if explained else sum(shares)
+    tried = [f"{name}: {why}" for name, why in reasons.items() if name not in {t.name for t in after.terms}]
     found = TorqueDiagnosis(
-        verdict, tuple(findings), before, after, share, tuple(located), tuple(curves), solution, tuple(reasons)
+        verdict, tuple(findings), before, after, share, tuple(located), tuple(curves), solution, filter, tuple(tried)
     )
     return found, withheld
+
+
+def _is_named(before: TorqueFit, after: TorqueFit) -> bool:
+    """Tell if effects explain the torques, or a single one nearly all of the misfit: several would be a patchwork."""
+    total = _excess(before)
+    most = len(after.terms) == 1 and _excess(before) - _excess(after) >= MIN_EXPLAINED_SHARE * total
+    return _explains(after) or most
+
+
+def _fit_without_effects(model: Model, logs: Sequence[Log], filter: Filter) -> tuple[TorqueFit, Solution]:
+    """Fit the parameters to torques. Raises NotIdentifiableError."""
+    rows = torque_rows(model, logs, filter)
+    _require_rows(model, rows)
+    errors = [identification.row_errors(model, x, filter, 1) for x in logs]
+    lowest = identification.row_levels(errors, model.nominal, [r.used for r in rows])
+    lowest = np.maximum(lowest, MIN_LEVEL * np.sqrt(np.mean(np.concatenate([r.Y**2 for r in rows], axis=1))))
+    solution = identification.solve_blocks([(r.W, r.Y) for r in rows], model.scale)
+    return TorqueFit(model, rows, solution.kept, lowest, []), solution
+
+
+def estimate_if_explained(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate | None:
+    """Return the estimate from torques, None if it leaves more than the sensors' noise.
+
+    Raises NotIdentifiableError.
+    """
+    fit = _fit_without_effects(model, logs, filter)[0]
+    if not _explains(fit):
+        return None
+    base, n = model.base, len(model.nominal)
+    size = np.linalg.norm(fit.whitened_design, axis=0)
+    value, covariance = np.full(n, np.nan), np.full((n, n), np.nan)
+    A = fit.whitened_design / size
+    value[fit.kept] = fit.whitened_x
+    covariance[np.ix_(fit.kept, fit.kept)] = np.linalg.inv(A.T @ A) / np.outer(size, size)
+    tied = {name: "" for k, name in enumerate(base.names) if k not in fit.kept}
+    errors = np.concatenate(fit.residual, axis=1)
+    return Estimate("wls", base.names, base.units, value, covariance, np.nan, np.nan, np.nan, errors, len(A), tied, ())
 
 
 def _require_rows(model: Model, rows: Sequence[TorqueRows]) -> None:
@@ -166,6 +205,16 @@ def _excess(fit: TorqueFit) -> float:
     """Sum of squares of the torques' errors beyond the noise, in units of the noise."""
     rows = list(fit.model.actuated)
     return float(np.maximum((fit.level[rows] / fit.lowest[rows]) ** 2 - 1, 0).sum())
+
+
+def names_in_clean_torques(d: TorqueDiagnosis, seed: int) -> list[str]:
+    """Return the names of effects that a search adds to clean simulated torques of the machine as diagnosed."""
+    clean = d.after.simulated(np.random.default_rng(seed))
+    blocks = [(r.W, r.Y) for r in clean.rows]
+    search = Search(clean.model, clean.rows, d.filter, identification.fit_rows(clean.model, blocks, d.solution))
+    found = search.extend(clean, {}, lambda share, what: None, Deadline())
+    known = {t.name for t in d.after.terms}
+    return [t.name for t in found.terms if t.name not in known]
 
 
 def _finding(search: Search, fit: TorqueFit, term: Term, share: float, kind: str) -> Finding:

@@ -25,7 +25,7 @@ class TorqueRows:
     """Filtered, decimated rows of one log, and the motion that effects see.
 
     W (n_rows, n, n_base), Y (n_rows, n) [N m or N]; used (n_rows, n): rows that are not of joints near rest. at (n,):
-    their samples. q, nu, a (N, n_q), t (N,) [s]: at the log's rate.
+    their samples. q, nu, a (N, n_q), t (N,) [s]: at the log's rate, with what effects of the model depend on, `beside`.
     """
 
     log: Log
@@ -37,6 +37,7 @@ class TorqueRows:
     nu: np.ndarray
     a: np.ndarray
     t: np.ndarray
+    beside: tuple[np.ndarray, ...]
 
     @property
     def stretch(self) -> np.ndarray:
@@ -54,7 +55,7 @@ def torque_rows(model: Model, logs: Sequence[Log], filter: Filter) -> list[Torqu
         s = samples(model, log, filter)
         last = s.q.shape[1] - filter.drop[1]
         at = kept_samples(filter.drop[0], last, filter.decimation)
-        found.append(TorqueRows(log, W, Y, used, at, s.q.T, s.nu.T, s.a.T, np.arange(len(log)) / rate))
+        found.append(TorqueRows(log, W, Y, used, at, s.q.T, s.nu.T, s.a.T, np.arange(len(log)) / rate, s.beside))
     return found
 
 
@@ -72,11 +73,12 @@ def effect_columns(
     parameters without effects.
     """
     standard = tuple(n for n in model.base.standard if "@" not in n)
-    p = (model.expand @ X)[: len(standard)]
+    p = (model.expand @ X)[[model.base.standard.index(n) for n in standard]]
+    bare = model.machine.model_copy(update={"effect": ()})
     parts: list[list[np.ndarray]] = [[] for _ in rows]
     for first in range(0, len(placed), BATCH):
         batch = placed[first : first + BATCH]
-        functions = signatures(model.machine, standard, batch)
+        functions = signatures(bare, standard, batch)
         for r, u, own in zip(rows, torques, parts, strict=True):
             z = integrate_memory(functions, r.q, r.nu, u, r.t, p, np.zeros((len(r.t), functions.n_map_inputs)))
             sample = (r.q.T, r.nu.T, r.a.T, u.T, r.t[None], z.T, _readings(model, r), ca.DM(p))
@@ -112,8 +114,10 @@ def _torque_of_angle_error(model: Model, r: TorqueRows, error: np.ndarray, X: np
     first, last = filter.drop[0], len(r.t) - filter.drop[1]
     moved = [decimate(x[:, first:last], filter.decimation) for x in (off.q, off.nu, off.a)]
     motion, p = (r.q[r.at].T, r.nu[r.at].T, r.a[r.at].T), model.expand @ X
+    beside = [x[:, r.at] for x in r.beside]
     less, more = (
-        model.predict(*(x + sign * d for x, d in zip(motion, moved, strict=True)), p).full() for sign in (-1, 1)
+        model.predict(*(x + sign * d for x, d in zip(motion, moved, strict=True)), p, *beside).full()
+        for sign in (-1, 1)
     )
     return np.asarray((less - more) / 2)
 
@@ -123,7 +127,8 @@ def needed_torques(model: Model, r: TorqueRows, X: np.ndarray) -> np.ndarray:
     found = []
     for first in range(0, len(r.t), BLOCK):
         at = slice(first, first + BLOCK)
-        torque = model.predict(r.q[at].T, r.nu[at].T, r.a[at].T, model.expand @ X).full()
+        beside = [x[:, at] for x in r.beside]
+        torque = model.predict(r.q[at].T, r.nu[at].T, r.a[at].T, model.expand @ X, *beside).full()
         found.append(torque[list(model.actuated)].T)
     return np.concatenate(found) - model.offsets @ X
 

@@ -25,7 +25,7 @@ from excite.smoothing import build_basis
 MIN_ODDS = 3.0  # of an effect over curves that mean nothing, given the number of names; chosen
 MIN_STDS = 2.0  # of an effect's size over its standard deviation; chosen
 MIN_SHARE = 0.02  # of the misfit of its joint that an effect takes; chosen
-MAX_TURNS = 10  # of choosing and fitting again; chosen
+MAX_TURNS = 20  # of choosing and fitting again; chosen
 TYPICAL_SHARE = 0.1  # of a torque's root mean square, about which the sizes of curves are sought; chosen
 SHAPE_STEP = 0.03  # relative step of the slope by a shape; chosen
 SHORT_DELAYS = 2.0, 8.0  # samples; trial values of delays and lags; chosen
@@ -79,7 +79,10 @@ class Search:
         self.machine = identification.with_soft_friction(model, [r.log for r in rows], filter).machine
         found = score_test.candidates(self.machine, [s.name for s in self.machine.sensors("full")], self.duration)
         # what shows in the torques of moving joints, or in what they seem to need: not near rest alone
-        found = [x for x in found if x.placed.effect.shaking is None and not x.placed.unsticking]
+        known = {e.name for e in model.effects}
+        found = [
+            x for x in found if x.placed.effect.shaking is None and not x.placed.unsticking and x.name not in known
+        ]
         self.candidates = score_test.renumber_columns([*found, *self._short_delays(found)])
         self.candidate_columns = self._columns(self.candidates)
         self.curves, self.group, self.groups = self._curves()
@@ -193,41 +196,46 @@ class Search:
         settled = [self.settle(fit, x, f) for x, f in zip(found.candidates, found.factors, strict=True)]
         return [self.term(x) for x in settled if x is not None]
 
-    def extend(self, fit: TorqueFit, report: ProgressCallback, deadline: Deadline) -> tuple[TorqueFit, list[str]]:
+    def extend(
+        self, fit: TorqueFit, reasons: dict[str, str], report: ProgressCallback, deadline: Deadline, curves: bool = True
+    ) -> TorqueFit:
         """Add the likeliest effects that hold, and drop those that do not, until none holds or time is over.
 
-        Return the last fit, and why effects that were likely were not added.
+        reasons: why effects that were likely were not added; they are not tried again. curves: effects must explain
+        more than curves that mean nothing.
         """
-        reasons: dict[str, str] = {}
         tried = {frozenset[str]()}
         for turn in range(MAX_TURNS):
             if deadline.is_over():
                 break
             report(0.2 + 0.6 * turn / MAX_TURNS, "testing effects on the torques")
             form, known = self.form(fit), {t.name for t in fit.terms}
-            rest = [x for x in form.candidates if x.name not in known and x.name not in reasons]
-            chosen = evidence.choose(replace(form, candidates=tuple(rest)), odds=MIN_ODDS)
+            form = replace(
+                form, candidates=tuple(x for x in form.candidates if x.name not in known and x.name not in reasons)
+            )
+            chosen = evidence.choose(form, odds=MIN_ODDS) if curves else evidence.choose(form.without_groups())
             if not chosen.candidates:
                 break
             new = fit.with_terms([*fit.terms, *self.refined(fit, chosen)])
-            new = self._that_hold(new, reasons)
+            new, given_up = self._that_hold(new)
+            reasons.update(given_up)
             names = frozenset(t.name for t in new.terms)
-            if names in tried:  # effects that replace each other in turn
+            if names in tried and not given_up:  # effects that replace each other in turn
                 break
             tried.add(names)
             fit = new
-        found = {t.name for t in fit.terms}
-        return fit, [f"{name}: {why}" for name, why in reasons.items() if name not in found]
+        return fit
 
-    def _that_hold(self, fit: TorqueFit, reasons: dict[str, str]) -> TorqueFit:
-        """Return a fit without the effects that do not hold beside the others, the last ones first."""
+    def _that_hold(self, fit: TorqueFit) -> tuple[TorqueFit, dict[str, str]]:
+        """Return a fit without the effects that do not hold beside the others, the last ones first, and why."""
+        reasons = dict[str, str]()
         for term in reversed(fit.terms):
             rest = fit.without(term)
             why = reason_against(rest, fit, term)
             if why:
                 reasons[term.name] = why
                 fit = rest
-        return fit
+        return fit, reasons
 
     def gain(self, rest: TorqueFit, placed: PlacedEffect) -> float:
         """Return the gain of an effect beside a fit: twice the logarithm of a Bayes factor."""

@@ -4,6 +4,7 @@ from .agreement import (
     compare_sources as compare_sources,
     describe_agreement as describe_agreement,
     describe_changes as describe_changes,
+    group_by_file as group_by_file,
     summarise_agreement as summarise_agreement,
 )
 from .bias import (

@@ -63,9 +63,7 @@ def compare_sources(
 
     Return no comparison and no estimates for one file, or if one of them gives no estimate. explained: see `identify`.
     """
-    groups: dict[str, list[Log]] = {}
-    for one in logs:
-        groups.setdefault(one.source.partition(" from row ")[0], []).append(one)
+    groups = group_by_file(logs)
     if len(groups) < 2:
         return None, []
     try:
@@ -73,6 +71,14 @@ def compare_sources(
     except NoEstimateError:
         return None, []
     return compare_logs(tuple(groups), estimates), estimates
+
+
+def group_by_file(logs: Sequence[Log]) -> dict[str, list[Log]]:
+    """Return the logs of each file, which gaps may have cut."""
+    groups: dict[str, list[Log]] = {}
+    for one in logs:
+        groups.setdefault(one.source.partition(" from row ")[0], []).append(one)
+    return groups
 
 
 def compare_logs(names: Sequence[str], estimates: Sequence[Estimate]) -> Agreement | None:

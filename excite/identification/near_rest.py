@@ -56,7 +56,7 @@ def with_soft_friction(model: Model, logs: Sequence[Log], filter: Filter) -> Mod
             smoothing = body.friction.smoothing.model_copy(update={"value": width})
             body = body.model_copy(update={"friction": body.friction.model_copy(update={"smoothing": smoothing})})
         bodies.append(body)
-    return model.for_machine(model.machine.model_copy(update={"body": bodies}))
+    return model.for_machine(model.machine.model_copy(update={"body": tuple(bodies)}))
 
 
 def friction_near_rest(model: Model, log: Log, filter: Filter) -> np.ndarray:
