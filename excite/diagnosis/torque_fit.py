@@ -15,11 +15,9 @@ from excite.diagnosis.torque_rows import STRETCHES, TorqueRows
 from excite.model import Model
 from excite.model.effects import PlacedEffect
 
-LAGS = 8  # order of the autoregression of what is left beside a course; chosen
 LONGEST_COURSE = 0.25  # of the rows, the longest correlation of a course; chosen
 COURSE_TIMES, WHITE_SHARES = 12, np.geomspace(1e-3, 1.0, 8)  # that are tried; of the variance, what is white
 LEVEL_PASSES = 4  # of the iteration for the rows' levels; chosen
-WHITE_SHARE = 0.01  # of the residuals taken for white noise, as a low-pass leaves none at high frequency; chosen
 FOLDS = 5  # parts that are withheld in turn; chosen
 
 
@@ -56,26 +54,20 @@ class Term:
 class Whitening:
     """Turns residuals of a torque into white noise of variance 1, whatever rows are left out.
 
-    They are a course (a stationary first-order process), white noise, and what is left of both is autoregressive. stay:
-    correlation of the course from row to row. share: of the variance, what is white. size: of the innovations. past
-    (LAGS,): coefficients of the innovations before.
+    They are a course, a stationary process of first order, and white noise. stay: correlation of the course from row to
+    row. share: of the variance, what is white. size: standard deviation of both together.
     """
 
     stay: float
     share: float
     size: float
-    past: np.ndarray
 
     def __call__(self, values: np.ndarray, used: np.ndarray) -> np.ndarray:
         """Return the innovations (n, ...) of values (n, ...), zero where rows are not used."""
         variance, gain = course_gains(used, np.array([self.stay]), np.array([self.share]))
         flat = values.reshape(len(values), -1)
         found = innovations(flat, used, self.stay, variance[:, 0], gain[:, 0]) / self.size
-        white = found.copy()
-        for k, a in enumerate(self.past, 1):
-            white[k:] -= a * found[:-k]
-        white[~used] = 0.0
-        return white.reshape(values.shape)
+        return found.reshape(values.shape)
 
     def simulate(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Return n rows of a course and white noise of this size."""
@@ -133,18 +125,8 @@ def find_whitening(pairs: Sequence[tuple[np.ndarray, np.ndarray]], least: float)
             cost[0, k] += (innovations(e[:, None], used, own, variance[:, k], gain[:, k]) ** 2).sum()
         cost[1] += np.log(variance).sum(axis=0)
     best = int(np.argmin(count * np.log(np.maximum(cost[0], 1e-300)) + cost[1]))
-    past, now = [], []
-    for (e, used), (variance, gain) in zip(pairs, gains, strict=True):
-        z = innovations(e[:, None], used, stay[best], variance[:, best], gain[:, best])[:, 0]
-        lagged = np.column_stack([np.concatenate([np.zeros(k), z[: len(z) - k]]) for k in range(1, LAGS + 1)])
-        past.append(lagged[used])
-        now.append(z[used])
-    P, y = np.concatenate(past), np.concatenate(now)
-    level = float(np.sqrt(np.mean(y**2))) if len(y) else 1.0
-    ridge = np.sqrt(WHITE_SHARE * len(y)) * level * np.eye(LAGS)
-    a = np.linalg.lstsq(np.concatenate([P, ridge]), np.append(y, np.zeros(LAGS)), rcond=None)[0]
-    size = float(np.sqrt(np.mean((y - P @ a) ** 2))) if len(y) else 1.0
-    return Whitening(float(stay[best]), float(share[best]), max(size, least), a)
+    size = float(np.sqrt(cost[0, best] / max(count, 1)))
+    return Whitening(float(stay[best]), float(share[best]), max(size, least))
 
 
 class TorqueFit:

@@ -24,7 +24,7 @@ from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.diagnosis import FORMULA_STD_SHARE, MIN_EXPLAINED_SHARE, Finding, NearestEffect, ParameterChange
 from excite.diagnosis.hold_out import HoldOutErrors, torque_names
 from excite.diagnosis.selection import ProgressCallback
-from excite.diagnosis.torque_fit import LAGS, Term, TorqueFit
+from excite.diagnosis.torque_fit import Term, TorqueFit
 from excite.diagnosis.torque_rows import TorqueRows, torque_rows
 from excite.diagnosis.torque_search import Search, scaled_magnitude
 from excite.errors import NotIdentifiableError
@@ -187,7 +187,7 @@ def _require_rows(model: Model, rows: Sequence[TorqueRows]) -> None:
     """Raise NotIdentifiableError if a joint hardly moves along all logs."""
     for k, body in zip(model.actuated, model.machine.actuated, strict=True):
         count = sum(int(r.used[k].sum()) for r in rows)
-        if count < MIN_ROWS or not all(r.Y.shape[1] > 2 * LAGS for r in rows):
+        if count < MIN_ROWS:
             raise NotIdentifiableError(
                 f"{rows[0].log.source}: {count} filtered rows with {body.where} in motion are too few to explain its"
                 f" torque (at least {MIN_ROWS}): record a longer log, or reduce the filter's decimation"
