@@ -115,7 +115,8 @@ def _shift(model: Model, estimate: Estimate, X: cp.Expression) -> cp.Expression:
     """Return how far identified parameters are from base parameters X [standard deviations, uncorrelated]."""
     kept = _identified(estimate)
     covariance = estimate.covariance[np.ix_(kept, kept)] / np.outer(model.scale[kept], model.scale[kept])
-    return _inverse_root(covariance) @ ((X[kept] - estimate.value[kept]) / model.scale[kept])
+    shift: cp.Expression = _inverse_root(covariance) @ ((X[kept] - estimate.value[kept]) / model.scale[kept])
+    return shift
 
 
 def _solved(problem: cp.Problem, tolerance: float = 1e-10) -> bool:
