@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import glob
+import itertools
 import json
 import os
 import re
@@ -24,16 +25,10 @@ from excite.errors import DiskError, FolderError
 
 SUMMARY = "summary.json"
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # what the user can mend, and no defect of the program
+MAX_NAME = 60  # letters of a result's name: of four bytes each they fit into a file name
 MOST_DIGITS = 300  # of an integer: floats end at 1.8e308
-REQUEST_KEYS = (
-    "objective",
-    "duration_s",
-    "method",
-    "runs",
-    "samples",
-    "starts",
-    "seed",
-)  # entries of a summary that say how a result was made
+# entries of a summary that say how a result was made
+REQUEST_KEYS = ("objective", "duration_s", "method", "runs", "samples", "starts", "seed")
 # names of the files that the program writes into a result folder
 OWN_NAMES = re.compile(
     r"summary\.json|machine\.(json|toml)|contact\.toml|(profile|phases|covariance|tolerances|prediction|wiring|log_template)\.csv|README\.md"
@@ -78,6 +73,20 @@ def _git(place: Path, *arguments: str) -> str:
 def real(path: str | Path) -> Path:
     """Return the absolute path behind links; of a link that leads to itself its own, where Path.resolve raises."""
     return Path(os.path.realpath(path))
+
+
+def folder_of_check(place: Path, log: Path) -> Path:
+    """Return the folder in `place` for the check of a log: that of its last one, or one that is not there yet."""
+    plain = f"log-{log.name[:MAX_NAME]}"
+    named = (place / (plain if k == 1 else f"{plain}-{k}") for k in itertools.count(1))
+    return next(folder for folder in named if not os.path.lexists(folder) or _is_check_of(folder, log))
+
+
+def _is_check_of(folder: Path, log: Path) -> bool:
+    try:
+        return real(read_json(folder / SUMMARY)["log"]) == real(log)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 def check_out_folder(out: Path, inputs: Iterable[Path] = (), option: str = "--out") -> None:

@@ -16,7 +16,6 @@ from excite.logs import SUFFIXES
 from excite.model.machine import MACHINES, Machine, is_machine_file, load_machine, machine_files, shipped_machines
 
 MOST_PASSED_OVER = 20  # lines about what no step can show
-MAX_NAME = 60  # letters of a result's name: of four bytes each they fit into a file name
 STATE = "app.json"  # choices of the day that no result holds
 STEPS = {
     "machine": "Machine",
@@ -63,10 +62,7 @@ NUMBERS = {  # fields of numbers by step
         "sigma_max": NumberField("Largest standard deviation allowed [%]", 0.001),
         "seed": NumberField("Seed", 0, whole=True, needed=True),
     },
-    "drive": {
-        "phases": NumberField("Most phases", 2, whole=True),
-        "shortest": NumberField("Shortest phase [s]", 0.5),
-    },
+    "drive": {"phases": NumberField("Most phases", 2, whole=True), "shortest": NumberField("Shortest phase [s]", 0.5)},
     "log": {"seed": NumberField("Seed", 0, whole=True, needed=True)},
     "diagnose": {"budget": NumberField("Time for the search [s]", 1)},
 }
@@ -399,7 +395,7 @@ class Day:
         assert self.machine is not None
         given = str(self.forms[step].get("out") or "").strip()
         if given:
-            return self.folder / Path(given.replace("\0", "")).name[:MAX_NAME]
+            return self.folder / Path(given.replace("\0", "")).name[: output.MAX_NAME]
         plain = self.folder / f"{step}-{workflows.machine_stem(self.machine)}"
         if step != "design":
             return plain
@@ -410,15 +406,8 @@ class Day:
         """Return the arguments of a step's command. log: of the log step, the log to check."""
         assert self.machine is not None
         if step == "log":
-            return [
-                "log",
-                "check",
-                log,
-                "--machine",
-                self.machine,
-                "--out",
-                str(self.folder / f"log-{Path(log).name[:MAX_NAME]}"),
-            ]
+            place = output.folder_of_check(self.folder, Path(log))
+            return ["log", "check", log, "--machine", self.machine, "--out", str(place)]
         form, out = self.forms[step], ["--out", str(self.out(step))]
         if step == "machine":
             return ["machine", "check", str(self.machine_path()), *out]
@@ -431,10 +420,7 @@ class Day:
         words = self.accepted_words()
         accept = ["--accept", words] if words else []
         options = ("method",) if step == "identify" else ("budget",)
-        return [
-            *(step, self.machine, *self.logs, *_options(form, options), *_flags(form, "next")),
-            *(*accept, *out),
-        ]
+        return [*(step, self.machine, *self.logs, *_options(form, options), *_flags(form, "next")), *(*accept, *out)]
 
     def start(self, step: str, arguments: list[str] | None = None, then: Callable[[Job], None] | None = None) -> None:
         """Run a step's command, or another for it. then: called after it has ended. Does nothing while one runs."""

@@ -264,9 +264,9 @@ def check_log(
 
     Example: excite log check log.csv --machine va12
     """
-    from excite import reports
+    from excite import output, reports
 
-    out = out or Path(f"results/log-{path.stem}")
+    out = out or output.folder_of_check(Path("results"), path)
     write_check(
         path,
         out,

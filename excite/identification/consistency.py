@@ -37,7 +37,8 @@ def nearest_possible(model: Model, estimate: Estimate) -> Estimate:
     bound at an active constraint. The residual is not recomputed (see `constrained_estimate`). Raises
     NotConsistentError.
     """
-    kept, distance, X = _nearest(model, estimate)
+    distance, X = _nearest(model, estimate)
+    kept = _identified(estimate)
     value = np.full(len(estimate.value), np.nan)
     value[kept] = X[kept]
     shift_in_stds = (value[kept] - estimate.value[kept]) / estimate.std[kept]
@@ -62,21 +63,17 @@ def constrained_estimate(model: Model, estimate: Estimate, blocks: Sequence[Bloc
 def possible_standard(model: Model, estimate: Estimate) -> tuple[dict[str, float], str | None]:
     """Return the standard parameters [SI] by name of a possible machine with the estimated torques, and a note.
 
-    Of all such machines it is the nearest to the machine file, relative to the size of each parameter. If no possible
-    machine has the estimated values, it is one with those of the nearest possible estimate, and the note says how far
-    that is; otherwise the note is None. Raises NotConsistentError.
+    Of all machines hardly further from the estimate than the nearest possible one, it is the nearest to the machine
+    file, relative to the size of each parameter. If a joint's torques differ from the estimated ones, the note says how
+    much; otherwise it is None. Raises NotConsistentError.
     """
-    kept, distance, X = _nearest(model, estimate)
+    distance, _ = _nearest(model, estimate)
     scaled, by_name, base = _variables(model)
     nominal = np.array([v for v, _ in standard_parameters(model.machine).values()]) / _scales(model)
-    for target in (estimate.value, X):
-        equal = (base[kept] - target[kept]) / model.scale[kept] == 0
-        # half the margin, as X lies on the whole one
-        possible = _possibility_constraints(model, by_name, INTERIOR_MARGIN / 2)
-        problem = cp.Problem(cp.Minimize(cp.sum_squares(scaled - nominal)), [equal, *possible])
-        if _solved(problem):
-            break
-    else:
+    # half the margin, and hardly further: the nearest machine lies inside, as the solver needs it
+    near = cp.norm(_shift(model, estimate, base)) <= distance + NOTABLE_SHIFT * (1 + distance)
+    possible = _possibility_constraints(model, by_name, INTERIOR_MARGIN / 2)
+    if not _solved(cp.Problem(cp.Minimize(cp.norm(scaled - nominal)), [near, *possible])):
         raise NotConsistentError("no possible machine found near the estimate")
     standard = {name: float(x.value) for name, x in by_name.items()}
     wanted = np.where(np.isfinite(estimate.value), estimate.value, np.asarray(base.value))
@@ -85,33 +82,41 @@ def possible_standard(model: Model, estimate: Estimate) -> tuple[dict[str, float
         return standard, None
     return standard, (
         f"no real machine has the identified values: the nearest possible one is written, {distance:.1f} standard"
-        f" deviations away; its torques differ by {format_number(100 * gap, 2)} % (rms over random motions)"
+        f" deviations away; its torques differ by {format_number(100 * gap, 2)} % in a joint (rms over random motions)"
     )
 
 
 def _torque_gap(model: Model, X: np.ndarray, wanted: np.ndarray) -> float:
-    """Return by how much torques of base parameters X (n_base,) differ from those wanted, of their rms."""
+    """Return by how much torques of base parameters X (n_base,) differ from those wanted, of their rms in a joint."""
     rng = np.random.default_rng(0)
     n = len(model.coordinates)
     beside = [np.zeros((x.numel(), RANDOM_MOTIONS)) for x in model.effect_symbols()]
     W = model.stacked_regressor(*rng.uniform(-1, 1, (3, n, RANDOM_MOTIONS)), *beside)
-    return float(np.linalg.norm(W @ (X - wanted)) / max(np.linalg.norm(W @ wanted), np.finfo(float).tiny))
+    gap, size = (np.linalg.norm(W @ x, axis=0) for x in (X - wanted, wanted))
+    return float((gap / np.maximum(size, max(INTERIOR_MARGIN * size.max(), np.finfo(float).tiny))).max())
 
 
-def _nearest(model: Model, estimate: Estimate) -> tuple[np.ndarray, float, np.ndarray]:
-    """Find the nearest possible machine in the metric of the estimate's covariance.
-
-    Returns identified parameters (indices), distance [standard deviations], base parameters.
-    """
-    kept = np.flatnonzero(np.isfinite(estimate.value) & np.isfinite(estimate.std))
+def _nearest(model: Model, estimate: Estimate) -> tuple[float, np.ndarray]:
+    """Return the distance [standard deviations] and base parameters of the possible machine nearest to an estimate."""
     _, by_name, X = _variables(model)
-    shift = (X[kept] - estimate.value[kept]) / model.scale[kept]
-    covariance = estimate.covariance[np.ix_(kept, kept)] / np.outer(model.scale[kept], model.scale[kept])
-    cost = cp.sum_squares(_inverse_root(covariance) @ shift)
+    cost = cp.sum_squares(_shift(model, estimate, X))
     problem = cp.Problem(cp.Minimize(cost), _possibility_constraints(model, by_name, INTERIOR_MARGIN))
     if not _solved(problem) or X.value is None:
         raise NotConsistentError("no possible machine found near the estimate")
-    return kept, float(np.sqrt(max(cost.value, 0.0))), np.asarray(X.value)
+    return float(np.sqrt(max(cost.value, 0.0))), np.asarray(X.value)
+
+
+def _identified(estimate: Estimate) -> np.ndarray:
+    """Return the indices of the parameters that were identified."""
+    return np.flatnonzero(np.isfinite(estimate.value) & np.isfinite(estimate.std))
+
+
+def _shift(model: Model, estimate: Estimate, X: cp.Expression) -> cp.Expression:
+    """Return how far identified parameters are from base parameters X [standard deviations, uncorrelated]."""
+    kept = _identified(estimate)
+    covariance = estimate.covariance[np.ix_(kept, kept)] / np.outer(model.scale[kept], model.scale[kept])
+    shift: cp.Expression = _inverse_root(covariance) @ ((X[kept] - estimate.value[kept]) / model.scale[kept])
+    return shift
 
 
 def _solved(problem: cp.Problem, tolerance: float = 1e-10) -> bool:

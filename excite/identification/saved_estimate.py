@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pandas as pd
@@ -65,7 +65,7 @@ def read_estimate(folder: Path) -> SavedEstimate:
     except (OSError, ValueError, MachineError):
         raise EstimateFolderError(f"{folder / MACHINE}: missing or damaged, {AGAIN}") from None
     try:
-        estimate = _estimate(summary, pd.read_csv(folder / COVARIANCE, index_col="parameter"))
+        estimate = _estimate(summary, folder / COVARIANCE)
         if (folder / TOLERANCES).is_file():
             shifts = pd.read_csv(folder / TOLERANCES, index_col="source")
             by_source = dict(zip(shifts.index, shifts[list(estimate.names)].to_numpy(float), strict=True))
@@ -73,6 +73,8 @@ def read_estimate(folder: Path) -> SavedEstimate:
             if not np.isfinite(variances).all():
                 raise ValueError("shifts that are no numbers")
             estimate = replace(estimate, tolerated=by_source)
+    except EstimateFolderError:
+        raise
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError):
         raise EstimateFolderError(
             f"{folder}: {output.SUMMARY}, {COVARIANCE} or {TOLERANCES} is damaged, {AGAIN}"
@@ -82,33 +84,41 @@ def read_estimate(folder: Path) -> SavedEstimate:
     return SavedEstimate(summary, model, estimate)
 
 
-def _estimate(summary: dict[str, Any], covariance: pd.DataFrame) -> Estimate:
-    """Build the estimate of a summary. Raises ValueError, KeyError, TypeError, AttributeError for a damaged one."""
+def _covariance(path: Path, names: tuple[str, ...], known: np.ndarray) -> np.ndarray:
+    """Read the covariance (n, n) of parameters of which some are known (n,). Raises EstimateFolderError, ValueError."""
+
+    def refuse(what: str) -> NoReturn:
+        raise EstimateFolderError(f"{path}: {what}; undo what was changed in it, or {AGAIN}")
+
+    table = pd.read_csv(path, index_col="parameter")
+    if not tuple(table.columns) == tuple(table.index) == names:
+        refuse(f"has other parameters than {output.SUMMARY}, or another order of them")
+    spread = table.to_numpy(float)
+    for j, k in np.argwhere(np.isfinite(spread) != np.outer(known, known)):
+        refuse(f"{names[j]}, {names[k]}: must {'' if known[j] and known[k] else 'not '}have a number")
+    variance = np.where(known, np.diag(spread), 1.0)
+    for k in np.flatnonzero(variance < 0):
+        refuse(f"{names[k]}: its variance is below zero")
+    std = np.sqrt(np.where(variance > 0, variance, 1.0))
+    correlation = np.nan_to_num(spread) / np.outer(std, std)
+    for j, k in np.argwhere(np.abs(correlation - correlation.T) > MOST_SKEW):
+        refuse(f"{names[j]}, {names[k]}: is not the number of {names[k]}, {names[j]}")
+    if np.linalg.eigvalsh((correlation + correlation.T) / 2).min(initial=0.0) < -MOST_SKEW:
+        refuse("a sum of parameters has a variance below zero")
+    return (spread + spread.T) / 2
+
+
+def _estimate(summary: dict[str, Any], covariance: Path) -> Estimate:
+    """Build the estimate of a summary. Raises EstimateFolderError, or what damaged values raise."""
     rows = summary["parameters"]
     names = tuple(rows)
-    if tuple(covariance.columns) != names or tuple(covariance.index) != names:
-        raise ValueError("names differ")
-    spread = covariance.to_numpy(float)
     value = np.array([r["value"] for r in rows.values()], float)
-    known = np.isfinite(value)
-    if not (np.isfinite(spread) == np.outer(known, known)).all():
-        raise ValueError("no covariance of these values")
-    variance = np.diag(spread)[known]
-    if (variance < 0).any():
-        raise ValueError("variances below zero")
-    std = np.sqrt(np.where(variance > 0, variance, 1.0))
-    correlation = spread[np.ix_(known, known)] / np.outer(std, std)
-    if (np.abs(correlation - correlation.T) > MOST_SKEW).any():
-        raise ValueError("no covariance")
-    spread = (spread + spread.T) / 2
-    if np.linalg.eigvalsh((correlation + correlation.T) / 2).min(initial=0.0) < -MOST_SKEW:
-        raise ValueError("variances of sums below zero")
     return Estimate(
         str(summary["method"]),
         names,
         tuple(str(r["unit"]) for r in rows.values()),
         value,
-        spread,
+        _covariance(covariance, names, np.isfinite(value)),
         float(summary["cond_w"]),
         float(summary["cond_phi"]),
         float(summary["relative_error_percent"] or np.nan),

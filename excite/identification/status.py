@@ -29,12 +29,7 @@ MIN_NOMINAL_SHARE = 1e-3  # of the largest nominal value in a unit, below which 
 # Factor between two units, number of values that must be off by it, relative deviation from it, and what to ask. Chance
 # alone leaves a value of a roughly written machine file at one of the small factors, hardly two of them; chosen.
 UNIT_FACTORS = (
-    (
-        1000.0,
-        1,
-        0.1,
-        "is a column in mm, or in kN, where the machine file says otherwise? check the sensors' units",
-    ),
+    (1000.0, 1, 0.1, "is a column in mm, or in kN, where the machine file says otherwise? check the sensors' units"),
     (180 / math.pi, 2, 0.1, "is an angle in degrees where the machine file says radians, or the reverse?"),
     (30 / math.pi, 2, 0.03, "is a speed in rpm where the machine file says rad/s, or the reverse?"),
 )

@@ -73,11 +73,7 @@ class WhiteResiduals:
 
 
 def white_residuals(
-    model: Model,
-    log: Log,
-    filter: Filter,
-    courses: Courses,
-    near: tuple[StateSpace, Trajectory] | None = None,
+    model: Model, log: Log, filter: Filter, courses: Courses, near: tuple[StateSpace, Trajectory] | None = None
 ) -> WhiteResiduals:
     """Smooth a log with all parameters held at the nominal values, and whiten residuals and signatures.
 
@@ -130,12 +126,7 @@ def white_residuals(
 
 
 def with_channels(
-    model: Model,
-    log: Log,
-    filter: Filter,
-    courses: Courses,
-    gains: Sequence[tuple[int, float]],
-    lacking: np.ndarray,
+    model: Model, log: Log, filter: Filter, courses: Courses, gains: Sequence[tuple[int, float]], lacking: np.ndarray
 ) -> WhiteResiduals:
     """Whiten what is left of a log beyond the torques that a discrepancy explains, at the nominal values.
 

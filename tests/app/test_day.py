@@ -216,6 +216,17 @@ def test_logs_of_one_stem_have_a_check_each(tmp_path: Path) -> None:
     assert len(places) == 2
 
 
+def test_logs_of_one_name_have_a_check_each(log: Path, tmp_path: Path, excite: Excite) -> None:
+    day, logs = Day(tmp_path), [tmp_path / "monday" / "log.csv", tmp_path / "tuesday" / "log.csv"]
+    day.machine = "va12_straight"
+    for path in (*logs, logs[0]):
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(log.read_bytes())
+        excite(*day.command("log", str(path)))
+    assert all(day.check_of(str(path)) for path in logs)
+    assert len(day.results("log")) == 2
+
+
 def test_the_window_lists_a_log_of_every_format_that_is_read(tmp_path: Path) -> None:
     every = sorted(str(tmp_path / f"log{ending}") for ending in SUFFIXES)
     for path in every:

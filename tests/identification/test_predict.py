@@ -317,6 +317,15 @@ def test_a_damaged_estimate_is_one_line(spoil: Callable[[Path], object], place: 
     assert "\n" not in str(err.value)
 
 
+def test_a_covariance_changed_by_hand_says_where(place: Path, tmp_path: Path) -> None:
+    """Whoever changed it by hand wants it undone, not identified again."""
+    folder = tmp_path / "found"
+    shutil.copytree(place / "found", folder)
+    changed_covariance(lambda table: table.assign(M=table["M"].where(table.index != "Kx1", 3 * table["M"])))(folder)
+    with pytest.raises(EstimateFolderError, match=r"covariance.csv: M, Kx1: is not the number of Kx1, M; undo what"):
+        read_estimate(folder)
+
+
 def test_an_invalid_estimate_ends_with_1(place: Path, tmp_path: Path, excite: Excite) -> None:
     folder = tmp_path / "found"
     shutil.copytree(place / "found", folder)

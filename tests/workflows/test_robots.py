@@ -135,6 +135,21 @@ def test_impossible_values_are_written_with_how_far_the_nearest_machine_is(tmp_p
     assert all(np.linalg.eigvalsh(i.toPseudoInertia().toMatrix()).min() > 0 for i in bodies)
 
 
+@pytest.mark.parametrize("name", ["ur5", "bolt"])
+def test_a_rough_estimate_is_written_with_possible_bodies(name: str, tmp_path: Path) -> None:
+    """Every value is off by 30 %, so many bodies lie on the edge of what is possible."""
+    file, written = tmp_path / "robot.urdf", tmp_path / "written.urdf"
+    file.write_text(robots.urdf(name))
+    model = read(file, tmp_path).model
+    errors = np.random.default_rng(5).standard_normal(len(model.scale))
+    rough = estimate(model, model.nominal + 0.3 * np.abs(model.scale) * errors)
+    text, notes = urdf_with_estimate(file, model, rough)
+    assert any("the nearest possible one is written" in n for n in notes)
+    written.write_text(text)
+    bodies = list(pin.buildModelFromUrdf(str(written)).inertias)[1:]
+    assert all(np.linalg.eigvalsh(i.toPseudoInertia().toMatrix()).min() > 0 for i in bodies)
+
+
 @pytest.mark.parametrize("last", ["1e-12", "0"])
 def test_a_residue_in_the_file_does_not_pin_what_was_identified(last: str, tmp_path: Path) -> None:
     """A centre of mass 1e-12 m beside the axis is one on the axis: the identified one is written whole."""
