@@ -1,12 +1,10 @@
-"""Diagnose a machine without slips from the torques of its joints, by regression along the measured motion.
+"""Diagnose a machine whose joints are all driven from their torques, along the measured motion.
 
-Real robots and rigs rarely follow their model in open loop, and then there is no smoothed motion whose innovations
-could be tested. Their torques are linear in the parameters along the measured motion, and stay so with effects of the
-catalogue as further columns. What the model leaves is correlated over time, so rows are whitened by an autoregression
-of the residuals (C. C. Cochrane and G. H. Orcutt, J. American Statistical Association 44, 1949), a column is tested by
-a score test whose variance is that from stretch to stretch (K.-Y. Liang and S. L. Zeger, Biometrika 73, 1986), and
-columns compete by their Bayesian information (G. Schwarz, Annals of Statistics 6, 1978), which pays for their number.
-A column is kept only if it predicts stretches that it was not fitted to.
+These torques are linear in the parameters, and stay so with effects of the catalogue as further columns. What the model
+leaves lasts a while, so rows are whitened as a course and white noise (`torque_fit`). Effects compete by their evidence
+beside curves of speed, position and time that mean nothing (`torque_search`), as they do in joint smoothing. One is
+kept only if it predicts stretches that it was not fitted to. What no curve is worse at explaining is a correction at
+most.
 """
 
 from __future__ import annotations

@@ -25,12 +25,11 @@ from excite.smoothing import build_basis
 MIN_ODDS = 3.0  # of an effect over curves that mean nothing, given the number of names; chosen
 MIN_STDS = 2.0  # of an effect's size over its standard deviation; chosen
 MIN_SHARE = 0.02  # of the misfit of its joint that an effect takes; chosen
-MAX_TURNS = 20  # of choosing and fitting again; chosen
 TYPICAL_SHARE = 0.1  # of a torque's root mean square, about which the sizes of curves are sought; chosen
 SHAPE_STEP = 0.03  # relative step of the slope by a shape; chosen
 SHORT_DELAYS = 2.0, 8.0  # samples; trial values of delays and lags; chosen
-NEARBY_OCTAVES = 1.0, 0.3, 0.09, 0.03  # to both sides of a magnitude to which an effect is not proportional; chosen
-MAGNITUDES = 9  # that are tried there; chosen
+NEARBY = np.linspace(-1, 1, 9)  # magnitudes tried beside one, over the reach
+REACHES = 1.0, 0.3, 0.09, 0.03  # [octaves] in turn, of an effect that is not proportional to its magnitude; chosen
 MIN_UNABSORBED_SHARE = 1e-4  # share of a column below which the parameters absorb it; chosen
 
 
@@ -167,8 +166,8 @@ class Search:
             return replace(placed, values={**placed.values, "A": scaled_magnitude(placed, float(factor[0]))})
         if not factor[0] > 0:
             return None
-        for octaves in NEARBY_OCTAVES:
-            amounts = placed.values["A"] * 2 ** (octaves * np.linspace(-1, 1, MAGNITUDES))
+        for reach in REACHES:
+            amounts = placed.values["A"] * 2 ** (reach * NEARBY)
             tried = [replace(placed, values={**placed.values, "A": float(x)}) for x in amounts]
             form = self.form(fit, [Candidate(x, (0,)) for x in tried]).reduced()
             at = np.arange(len(self.group), len(form.right_side))
@@ -205,10 +204,8 @@ class Search:
         more than curves that mean nothing.
         """
         tried = {frozenset[str]()}
-        for turn in range(MAX_TURNS):
-            if deadline.is_over():
-                break
-            report(0.2 + 0.6 * turn / MAX_TURNS, "testing effects on the torques")
+        while not deadline.is_over():
+            report(0.2 + 0.6 * len(reasons) / (len(reasons) + len(fit.terms) + 5), "testing effects on the torques")
             form, known = self.form(fit), {t.name for t in fit.terms}
             form = replace(
                 form, candidates=tuple(x for x in form.candidates if x.name not in known and x.name not in reasons)
@@ -218,6 +215,8 @@ class Search:
                 break
             new = fit.with_terms([*fit.terms, *self.refined(fit, chosen)])
             new, given_up = self._that_hold(new)
+            wrong = {x.name for x in chosen.candidates} - {t.name for t in new.terms} - set(given_up)
+            given_up |= dict.fromkeys(wrong, "its sign is impossible")
             reasons.update(given_up)
             names = frozenset(t.name for t in new.terms)
             if names in tried and not given_up:  # effects that replace each other in turn
