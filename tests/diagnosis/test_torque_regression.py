@@ -1,4 +1,4 @@
-"""Diagnosis by regression on the torques: hidden truth in inverse dynamics written here, and real robots."""
+"""Diagnosis by the torques of driven joints: hidden truth in inverse dynamics written here, and real robots."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ import scipy.signal
 from support.drives import arm_motion
 from support.files import SHARED
 
-from excite.diagnosis import machine_file
+from excite.diagnosis import count_false_alarms, explain, machine_file
 from excite.diagnosis.deadline import Deadline
+from excite.diagnosis.torque_fit import Whitening, find_whitening
 from excite.diagnosis.torque_regression import TorqueDiagnosis, diagnose_torques
 from excite.errors import NotIdentifiableError
 from excite.identification import identify, needed_sensors
@@ -290,3 +291,70 @@ def test_a_budget_gives_the_best_answer_so_far_and_says_so(tmp_path: Path) -> No
             break
     else:
         pytest.fail("no budget ended the search")
+
+
+def friction(q: np.ndarray, v: np.ndarray, F: np.ndarray) -> np.ndarray:
+    return -30 * np.abs(v) + 10 * np.sign(v) * np.exp(-np.abs(v) / 0.03)
+
+
+def test_two_effects_in_the_noise_of_a_sensor_are_named(emps: Model, tmp_path: Path) -> None:
+    """And none else; with them in the machine file, another log shows nothing, and what is new there gets its name."""
+    found = diagnosed(emps, rig_log(2, friction, error=0.0))
+    sizes = {f.effect: f.magnitude for f in found.findings}
+    assert found.verdict == "named"
+    assert sizes == {
+        "asymmetric_viscous": pytest.approx(-30, rel=0.05),
+        "stribeck_friction": pytest.approx(10, rel=0.1),
+    }
+    text = machine_file("emps", emps.machine, found)
+    assert text is not None
+    (tmp_path / "machine.toml").write_text(text)
+    extended = build(load_machine(str(tmp_path / "machine.toml")))
+    assert diagnosed(extended, rig_log(3, friction, error=0.0)).verdict == "clean"
+    more = diagnosed(extended, rig_log(3, lambda q, v, F: friction(q, v, F) + 60 * v * np.abs(v), error=0.0))
+    assert [f.effect for f in more.findings] == ["quadratic_drag"]
+
+
+def test_logs_of_a_rig_that_differ_are_told(emps: Model, tmp_path: Path) -> None:
+    """Dry friction of 10 N more on another day is no effect that the model lacks."""
+    paths = [tmp_path / "before.csv", tmp_path / "after.csv"]
+    for seed, path in enumerate(paths):
+        rig_log(seed, lambda q, v, F, more=10 * seed: more * np.sign(v), error=0.0).to_csv(path, index=False)
+    ready = prepare(emps, paths, needed_sensors(emps, "ols"))
+    found = explain(ready.model, ready.logs, ready.model.machine.filter)
+    assert found.differences is not None
+    (changed,) = found.differences.changed
+    assert changed.name == "Fc"
+    assert changed.value == pytest.approx([20.4, 30.4], abs=0.1)
+
+
+def test_clean_torques_of_the_fitted_rig_get_no_name(emps: Model) -> None:
+    """With the slow error that the log leaves."""
+    found = count_false_alarms(diagnosed(emps, rig_log(0, HIDDEN["asymmetric_viscous"][0])), 5)
+    assert found.verdicts == {"clean": 5}
+
+
+def test_innovations_are_those_of_the_covariance() -> None:
+    """By a Cholesky factor of the covariance of the rows that are used, with gaps."""
+    rng = np.random.default_rng(3)
+    n, stay, share = 60, 0.9, 0.2
+    used = rng.random(n) > 0.3
+    used[20:30] = False
+    values = rng.standard_normal((n, 2))
+    covariance = (1 - share) * stay ** np.abs(np.subtract.outer(np.arange(n), np.arange(n))) + share * np.eye(n)
+    expected = np.linalg.solve(np.linalg.cholesky(covariance[np.ix_(used, used)]), values[used])
+    found = Whitening(stay, share, 2.0)(values, used)
+    assert found[used] == pytest.approx(expected / 2.0)
+    assert not found[~used].any()
+
+
+def test_the_course_of_residuals_is_found() -> None:
+    """Size, correlation and the share of white noise, to what 20 000 rows tell."""
+    made = Whitening(float(np.exp(-1 / 20)), 0.05, 3.0)
+    series = made.simulate(20_000, np.random.default_rng(1))
+    found = find_whitening([(series, np.ones(len(series), bool))], 1e-9)
+    assert found.size == pytest.approx(3.0, rel=0.1)
+    assert np.log(found.stay) == pytest.approx(-1 / 20, rel=0.6)
+    white = found(series, np.ones(len(series), bool))
+    assert white.std() == pytest.approx(1.0, rel=0.02)
+    assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.1
