@@ -245,12 +245,12 @@ def least_gain(form: Form, odds: float = MIN_ODDS) -> float:
     return float(2 * np.log(odds * max(len({x.name for x in form.candidates}), 1)))
 
 
-def choose(form: Form, known: Collection[str] = (), odds: float = MIN_ODDS) -> Chosen:
+def choose(form: Form, known: Collection[str] = (), odds: float = MIN_ODDS, most: int = MOST_AT_ONCE) -> Chosen:
     """Add candidates one after the other, the one with the largest gain first, as long as the gain is clear.
 
     known: names of effects in the model, candidates of which are further harmonics. They are not added, but nothing
     that is as well a harmonic of them is, such as a ripple of another wheel that turns equally fast. odds: posterior
-    odds over unknown forces alone from which a candidate is added.
+    odds over unknown forces alone from which a candidate is added. most: of them.
 
     One gain alone counts where later ones are below MIN_SHARE of it: to first order, they may be errors of its form.
     """
@@ -258,7 +258,7 @@ def choose(form: Form, known: Collection[str] = (), odds: float = MIN_ODDS) -> C
     now = posterior(form, ())
     left = now.gain
     chosen, gains = list[Candidate](), list[float]()
-    while len(chosen) < MOST_AT_ONCE:
+    while len(chosen) < most:
         now = _exchanged(form, chosen, now, known)
         taken = {x.name for x in chosen}
         finalists = list[int]()

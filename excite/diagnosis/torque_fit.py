@@ -8,6 +8,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 import scipy.linalg
+import scipy.ndimage
 import scipy.signal
 
 from excite.diagnosis.hold_out import HoldOutErrors, torque_names
@@ -15,6 +16,7 @@ from excite.diagnosis.torque_rows import STRETCHES, TorqueRows
 from excite.model import Model
 from excite.model.effects import PlacedEffect
 
+BESIDE_REST = 4  # rows to both sides of a rest that do not count as innovations; chosen
 LONGEST_COURSE = 0.25  # of the rows, the longest correlation of a course; chosen
 COURSE_TIMES, WHITE_SHARES = 12, np.geomspace(1e-3, 1.0, 8)  # that are tried; of the variance, what is white
 LEVEL_PASSES = 4  # of the iteration for the rows' levels; chosen
@@ -63,17 +65,22 @@ class Whitening:
     size: float
 
     def __call__(self, values: np.ndarray, used: np.ndarray) -> np.ndarray:
-        """Return the innovations (n, ...) of values (n, ...), zero where rows are not used."""
+        """Return the innovations (n, ...) of values (n, ...), zero where rows are not used or near a rest."""
         variance, gain = course_gains(used, np.array([self.stay]), np.array([self.share]))
         flat = values.reshape(len(values), -1)
         found = innovations(flat, used, self.stay, variance[:, 0], gain[:, 0]) / self.size
-        return found.reshape(values.shape)
+        return (found * settled(used)[:, None]).reshape(values.shape)
 
     def simulate(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Return n rows of a course and white noise of this size."""
         drive = np.sqrt((1 - self.share) * np.append(1.0, np.full(n - 1, 1 - self.stay**2))) * rng.standard_normal(n)
         course = scipy.signal.lfilter([1.0], [1.0, -self.stay], drive)
         return np.asarray(self.size * (course + np.sqrt(self.share) * rng.standard_normal(n)))
+
+
+def settled(used: np.ndarray) -> np.ndarray:
+    """Find the rows (n,) that are used, as are their BESIDE_REST neighbours: a low-pass spreads what a rest hides."""
+    return np.asarray(scipy.ndimage.minimum_filter1d(used, 2 * BESIDE_REST + 1))
 
 
 def course_gains(used: np.ndarray, stay: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -118,12 +125,13 @@ def find_whitening(pairs: Sequence[tuple[np.ndarray, np.ndarray]], least: float)
     longest = max(LONGEST_COURSE * max(len(e) for e, _ in pairs), 2.0)
     times = np.geomspace(1.0, longest, COURSE_TIMES)
     stay, share = (x.ravel() for x in np.meshgrid(np.exp(-1 / times), WHITE_SHARES))
-    count = sum(int(used.sum()) for _, used in pairs)
+    count = sum(int(settled(used).sum()) for _, used in pairs)
     cost, gains = np.zeros((2, len(stay))), [course_gains(used, stay, share) for _, used in pairs]
     for (e, used), (variance, gain) in zip(pairs, gains, strict=True):
+        counts = settled(used)
         for k, own in enumerate(stay):
-            cost[0, k] += (innovations(e[:, None], used, own, variance[:, k], gain[:, k]) ** 2).sum()
-        cost[1] += np.log(variance).sum(axis=0)
+            cost[0, k] += (innovations(e[:, None], used, own, variance[:, k], gain[:, k])[counts] ** 2).sum()
+        cost[1] += np.log(variance[counts]).sum(axis=0)
     best = int(np.argmin(count * np.log(np.maximum(cost[0], 1e-300)) + cost[1]))
     size = float(np.sqrt(cost[0, best] / max(count, 1)))
     return Whitening(float(stay[best]), float(share[best]), max(size, least))

@@ -13,7 +13,7 @@ from excite.diagnosis import evidence, score_test, selection
 from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.evidence import Form
 from excite.diagnosis.parallel import CallRunner, run_in_turn
-from excite.diagnosis.score_test import Candidate
+from excite.diagnosis.score_test import MIN_SIGNATURE, Candidate
 from excite.diagnosis.selection import ProgressCallback
 from excite.diagnosis.torque_fit import Term, TorqueFit
 from excite.diagnosis.torque_rows import TorqueRows, effect_columns, needed_torques
@@ -30,6 +30,7 @@ SHAPE_STEP = 0.03  # relative step of the slope by a shape; chosen
 SHORT_DELAYS = 2.0, 8.0  # samples; trial values of delays and lags; chosen
 NEARBY = np.linspace(-1, 1, 9)  # magnitudes tried beside one, over the reach
 REACHES = 1.0, 0.3, 0.09, 0.03  # [octaves] in turn, of an effect that is not proportional to its magnitude; chosen
+LARGEST_VALUE = 1e12  # that a machine file takes
 MIN_UNABSORBED_SHARE = 1e-4  # share of a column below which the parameters absorb it; chosen
 
 
@@ -50,9 +51,9 @@ def scaled_magnitude(e: PlacedEffect, coefficient: float) -> float:
 
 def _is_impossible(e: PlacedEffect, coefficient: float) -> bool:
     """Tell if a coefficient gives an effect a sign or a size that it cannot have."""
-    size = coefficient * e.values["A"]
+    size = scaled_magnitude(e, coefficient) if coefficient else 0.0
     has_wrong_sign = size < 0 and (e.effect.positive or e.effect.opposes_motion)
-    return bool(has_wrong_sign or abs(size) > e.effect.largest)
+    return bool(has_wrong_sign or abs(size) > min(e.effect.largest, LARGEST_VALUE))
 
 
 def _phase(e: PlacedEffect) -> str | None:
@@ -144,7 +145,7 @@ class Search:
         A, b = Z.T @ Z, Z.T @ fit.whitened_torques
         left = Z[:, first:] - fit.basis @ (fit.basis.T @ Z[:, first:])
         square = (left**2).sum(axis=0)
-        absorbed = np.flatnonzero(square < MIN_UNABSORBED_SHARE * np.diag(A)[first:])
+        absorbed = np.flatnonzero(square < np.maximum(MIN_UNABSORBED_SHARE * np.diag(A)[first:], MIN_SIGNATURE))
         likeliest = np.abs(left.T @ fit.innovations) / np.maximum(square, 1e-300)
         likeliest[absorbed], absorbed = 0.0, absorbed + first
         A[absorbed], A[:, absorbed], b[absorbed] = 0.0, 0.0, 0.0
@@ -210,7 +211,10 @@ class Search:
             form = replace(
                 form, candidates=tuple(x for x in form.candidates if x.name not in known and x.name not in reasons)
             )
-            chosen = evidence.choose(form, odds=MIN_ODDS) if curves else evidence.choose(form.without_groups())
+            if curves:
+                chosen = evidence.choose(form, odds=MIN_ODDS, most=1)
+            else:
+                chosen = evidence.choose(form.without_groups(), most=1)
             if not chosen.candidates:
                 break
             new = fit.with_terms([*fit.terms, *self.refined(fit, chosen)])
