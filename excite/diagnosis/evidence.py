@@ -172,11 +172,13 @@ def posterior(
             return size, size, 0.0, size
         whole = size[:, None] * information * size
         whole[range(len(size)), range(len(size))] += 1
+        pull = size * right_side
         root, fault = lapack.dpotrf(whole, lower=1)
         if fault:  # eliminations leave rounding errors
             values, axes = np.linalg.eigh(whole)
-            root = np.linalg.cholesky((axes * np.maximum(values, 1.0)) @ axes.T)
-        pull = size * right_side
+            values = np.maximum(values, 1.0)
+            mean = axes @ (axes.T @ pull / values)
+            return mean, axes**2 @ (1 / values), float(pull @ mean - np.log(values).sum()), size
         mean = lapack.dpotrs(root, pull, lower=1)[0]
         variance = np.diag(lapack.dpotri(root, lower=1)[0])
         return mean, variance, float(pull @ mean - 2 * np.log(np.diag(root)).sum()), size
