@@ -10,6 +10,7 @@ import scipy.stats
 
 from excite import identification
 from excite.diagnosis import evidence, score_test, selection
+from excite.diagnosis.acceptance import MIN_STDS
 from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.evidence import Form
 from excite.diagnosis.parallel import CallRunner, run_in_turn
@@ -23,14 +24,12 @@ from excite.model.machine import EffectEntry, Filter
 from excite.smoothing import build_basis
 
 MIN_ODDS = 3.0  # of an effect over curves that mean nothing, given the number of names; chosen
-MIN_STDS = 2.0  # of an effect's size over its standard deviation; chosen
 MIN_SHARE = 0.02  # of the misfit of its joint that an effect takes; chosen
 TYPICAL_SHARE = 0.1  # of a torque's root mean square, about which the sizes of curves are sought; chosen
 SHAPE_STEP = 0.03  # relative step of the slope by a shape; chosen
 SHORT_DELAYS = 2.0, 8.0  # samples; trial values of delays and lags; chosen
 NEARBY = np.linspace(-1, 1, 9)  # magnitudes tried beside one, over the reach
 REACHES = 1.0, 0.3, 0.09, 0.03  # [octaves] in turn, of an effect that is not proportional to its magnitude; chosen
-LARGEST_VALUE = 1e12  # that a machine file takes
 MIN_UNABSORBED_SHARE = 1e-4  # share of a column below which the parameters absorb it; chosen
 
 
@@ -53,7 +52,7 @@ def _is_impossible(e: PlacedEffect, coefficient: float) -> bool:
     """Tell if a coefficient gives an effect a sign or a size that it cannot have."""
     size = scaled_magnitude(e, coefficient) if coefficient else 0.0
     has_wrong_sign = size < 0 and (e.effect.positive or e.effect.opposes_motion)
-    return bool(has_wrong_sign or abs(size) > min(e.effect.largest, LARGEST_VALUE))
+    return bool(has_wrong_sign or abs(size) > min(e.effect.largest, 1 / selection.SMALLEST_VALUE))
 
 
 def _phase(e: PlacedEffect) -> str | None:

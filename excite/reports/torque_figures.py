@@ -1,4 +1,4 @@
-"""Figures of a diagnosis by regression: errors of the torques, and the curves that they follow."""
+"""Figures of a diagnosis of torques: errors of the torques, and the curves that they follow."""
 
 from __future__ import annotations
 

@@ -135,7 +135,7 @@ def _count_false_alarms(
 
 
 def rivals(found: DiagnoseResult) -> Sequence[RivalPair]:
-    """Return the pairs of tied causes; a diagnosis by regression has none."""
+    """Return the pairs of tied causes; one of torques has none."""
     d = found.assessment.diagnosis
     return diagnosis.rival_pairs(d) if isinstance(d, Diagnosis) else ()
 
@@ -194,7 +194,7 @@ def _baseline_note(found: Diagnosis | TorqueDiagnosis) -> list[str]:
     """Say which model the "before" numbers are of, if the model without the findings can't follow the logs."""
     if not isinstance(found, Diagnosis):
         tried = [f"tried and not given: {'; '.join(found.rejected)}"] if found.rejected else []
-        return ["the torques are explained along the measured motion, by regression", *tried]
+        return ["the torques are explained along the measured motion", *tried]
     if found.sticks:
         return [
             "friction sticks: where a joint is near rest, its friction may have any value up to Fs in the model without"
