@@ -16,7 +16,7 @@ from excite.diagnosis.torque_rows import STRETCHES, TorqueRows
 from excite.model import Model
 from excite.model.effects import PlacedEffect
 
-BESIDE_REST = 4  # rows to both sides of a rest that do not count as innovations; chosen
+BESIDE_REST = 2  # rows to both sides of a rest that do not count as innovations; chosen
 LONGEST_COURSE = 0.25  # of the rows, the longest correlation of a course; chosen
 COURSE_TIMES, WHITE_SHARES = 12, np.geomspace(1e-3, 1.0, 8)  # that are tried; of the variance, what is white
 LEVEL_PASSES = 4  # of the iteration for the rows' levels; chosen

@@ -200,8 +200,8 @@ class Search:
     ) -> TorqueFit:
         """Add the likeliest effects that hold, and drop those that do not, until none holds or time is over.
 
-        reasons: why effects that were likely were not added; they are not tried again. curves: effects must explain
-        more than curves that mean nothing.
+        reasons: why effects that were likely were not added; they are tried again beside a further effect only. curves:
+        effects must explain more than curves that mean nothing.
         """
         tried = {frozenset[str]()}
         while not deadline.is_over():
@@ -225,6 +225,8 @@ class Search:
             if names in tried and not given_up:  # effects that replace each other in turn
                 break
             tried.add(names)
+            if len(new.terms) > len(fit.terms):  # what failed before may hold beside it
+                reasons.clear()
             fit = new
         return fit
 
