@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "lines": 58_760,
+    "lines": 58_740,
     "named constants": 825,
     "files over 600 lines": 2,
     "functions over 80 lines": 6,

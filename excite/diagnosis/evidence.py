@@ -27,7 +27,7 @@ from excite.diagnosis.score_test import (
     SignatureColumns,
     renumber_columns,
 )
-from excite.model.effects import PlacedEffect, Site
+from excite.model.effects import Site
 from excite.model.machine import Machine
 from excite.smoothing import SIZE_SCATTER, Fit, UnknownForces, sizes_step
 
@@ -76,18 +76,6 @@ class Form:
         right_side = self.right_side[keep] - self.information[np.ix_(keep, np.asarray(at))] @ value
         return replace(
             self, information=self.information[np.ix_(keep, keep)], right_side=right_side, outer=self.outer - len(at)
-        )
-
-    def without_groups(self) -> Form:
-        """Return the form without unknown forces."""
-        n = len(self.group)
-        keep = np.r_[: self.outer, self.outer + n : len(self.right_side)]
-        return replace(
-            self,
-            information=self.information[np.ix_(keep, keep)],
-            right_side=self.right_side[keep],
-            group=self.group[:0],
-            names=(),
         )
 
     @property
@@ -143,14 +131,15 @@ def build_form(
     for k, one in enumerate(unknown.groups):
         group[one.every] = k
     machine = along[0].space.model.machine
-    std = [amount_std(machine, x.placed, duration) for x in found for _ in x.columns]
-    return Form(A, b, K, group, tuple(g.name for g in unknown.groups), tuple(found), np.array(std))
+    std = amount_stds(machine, found, duration)
+    return Form(A, b, K, group, tuple(g.name for g in unknown.groups), tuple(found), std)
 
 
-def amount_std(machine: Machine, placed: PlacedEffect, duration: float) -> float:
-    """Return the prior standard deviation of an effect's amount, over its own, for logs of a duration [s]."""
-    typical = placed.effect.typical_magnitude(Site.of(machine, placed.bodies, duration))
-    return float(AMOUNT_STD * typical / abs(placed.values["A"]))
+def amount_stds(machine: Machine, found: Sequence[Candidate], duration: float) -> np.ndarray:
+    """Return the prior standard deviation of the factor of each candidate's columns, for logs of a duration [s]."""
+    found = [x for x in found for _ in x.columns]
+    typical = [x.placed.effect.typical_magnitude(Site.of(machine, x.placed.bodies, duration)) for x in found]
+    return np.array([AMOUNT_STD * size / abs(x.placed.values["A"]) for x, size in zip(found, typical, strict=True)])
 
 
 def _products(log: FittedLog, found: Sequence[Candidate]) -> np.ndarray:

@@ -225,7 +225,7 @@ def _has_harmonics(effect: Effect) -> bool:
 
 @dataclass(frozen=True)
 class Scored:
-    """What scores candidates: a machine, the duration [s] of the longest log, and forms of some candidates."""
+    """A machine with the duration [s] of its longest log, and a function that returns the form of some candidates."""
 
     machine: Machine
     duration: float

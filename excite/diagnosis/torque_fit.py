@@ -125,10 +125,10 @@ def find_whitening(pairs: Sequence[tuple[np.ndarray, np.ndarray]], least: float)
     longest = max(LONGEST_COURSE * max(len(e) for e, _ in pairs), 2.0)
     times = np.geomspace(1.0, longest, COURSE_TIMES)
     stay, share = (x.ravel() for x in np.meshgrid(np.exp(-1 / times), WHITE_SHARES))
-    count = sum(int(settled(used).sum()) for _, used in pairs)
-    cost, gains = np.zeros((2, len(stay))), [course_gains(used, stay, share) for _, used in pairs]
-    for (e, used), (variance, gain) in zip(pairs, gains, strict=True):
-        counts = settled(used)
+    count, cost = 0, np.zeros((2, len(stay)))
+    for e, used in pairs:
+        counts, (variance, gain) = settled(used), course_gains(used, stay, share)
+        count += int(counts.sum())
         for k, own in enumerate(stay):
             cost[0, k] += (innovations(e[:, None], used, own, variance[:, k], gain[:, k])[counts] ** 2).sum()
         cost[1] += np.log(variance[counts]).sum(axis=0)
@@ -179,7 +179,7 @@ class TorqueFit:
         return np.sqrt(square / np.maximum(sum(r.used.sum(axis=1) for r in self.rows), 1))
 
     def _whitening(self) -> list[Whitening]:
-        """What turns the residuals of each row into white noise of variance 1."""
+        """Find the whitening of each row's residuals."""
         found = []
         for k, lowest in enumerate(self.lowest):
             pairs = [(e[k], r.used[k]) for e, r in zip(self.residual, self.rows, strict=True)]
@@ -235,12 +235,12 @@ class TorqueFit:
     @cached_property
     def whitened_x(self) -> np.ndarray:
         """Coefficients (k,) of whitened rows."""
-        return solve(triangle(np.column_stack([self._whitened_design(self), self.whitened_torques])))
+        return solve(triangle(np.column_stack([self.whitened_design, self.whitened_torques])))
 
     @cached_property
     def innovations(self) -> np.ndarray:
         """Whitened residuals (N,)."""
-        return self.whitened_torques - self._whitened_design(self) @ self.whitened_x
+        return self.whitened_torques - self.whitened_design @ self.whitened_x
 
     @cached_property
     def basis(self) -> np.ndarray:

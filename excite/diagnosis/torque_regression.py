@@ -3,8 +3,7 @@
 These torques are linear in the parameters, and stay so with effects of the catalogue as further columns. What the model
 leaves lasts a while, so rows are whitened as a course and white noise (`torque_fit`). Effects compete by their evidence
 beside curves of speed, position and time that mean nothing (`torque_search`), as they do in joint smoothing. One is
-kept only if it predicts stretches that it was not fitted to. What no curve is worse at explaining is a correction at
-most.
+kept only if it predicts stretches that it was not fitted to. An effect that a curve explains as well is a correction.
 """
 
 from __future__ import annotations
@@ -116,8 +115,7 @@ def diagnose_torques(
     report, deadline = report or (lambda share, what: None), deadline or Deadline()
     report(0.05, "fitting the torques")
     before, solution = _fit_without_effects(model, logs, filter)
-    blocks = [(r.W, r.Y) for r in before.rows]
-    search = Search(model, before.rows, filter, identification.fit_rows(model, blocks, solution))
+    search = _search(before, filter, solution)
     reasons = dict[str, str]()
     after = search.extend(before, reasons, report, deadline)
     if not _is_named(before, after):  # what a curve explains better may still take a part of it, as a correction
@@ -144,10 +142,16 @@ def diagnose_torques(
     return found, withheld
 
 
+def _search(fit: TorqueFit, filter: Filter, solution: Solution) -> Search:
+    """Return a search for effects along the rows of a fit. solution: of the parameters alone."""
+    blocks = [(r.W, r.Y) for r in fit.rows]
+    return Search(fit.model, fit.rows, filter, identification.fit_rows(fit.model, blocks, solution))
+
+
 def _is_named(before: TorqueFit, after: TorqueFit) -> bool:
     """Tell if effects explain the torques, or a single one nearly all of the misfit: several would be a patchwork."""
     total = _excess(before)
-    most = len(after.terms) == 1 and _excess(before) - _excess(after) >= MIN_EXPLAINED_SHARE * total
+    most = len(after.terms) == 1 and total - _excess(after) >= MIN_EXPLAINED_SHARE * total
     return _explains(after) or most
 
 
@@ -208,9 +212,7 @@ def _excess(fit: TorqueFit) -> float:
 def names_in_clean_torques(d: TorqueDiagnosis, seed: int) -> list[str]:
     """Return the names of effects that a search adds to clean simulated torques of the machine as diagnosed."""
     clean = d.after.simulated(np.random.default_rng(seed))
-    blocks = [(r.W, r.Y) for r in clean.rows]
-    search = Search(clean.model, clean.rows, d.filter, identification.fit_rows(clean.model, blocks, d.solution))
-    found = search.extend(clean, {}, lambda share, what: None, Deadline())
+    found = _search(clean, d.filter, d.solution).extend(clean, {}, lambda share, what: None, Deadline())
     known = {t.name for t in d.after.terms}
     return [t.name for t in found.terms if t.name not in known]
 

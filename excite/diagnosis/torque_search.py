@@ -13,7 +13,7 @@ from excite.diagnosis import evidence, score_test, selection
 from excite.diagnosis.acceptance import MIN_STDS
 from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.evidence import Form
-from excite.diagnosis.parallel import CallRunner, run_in_turn
+from excite.diagnosis.parallel import run_in_turn
 from excite.diagnosis.score_test import MIN_SIGNATURE, Candidate
 from excite.diagnosis.selection import ProgressCallback
 from excite.diagnosis.torque_fit import Term, TorqueFit
@@ -23,7 +23,7 @@ from excite.model.effects import Effect, PlacedEffect
 from excite.model.machine import EffectEntry, Filter
 from excite.smoothing import build_basis
 
-MIN_ODDS = 3.0  # of an effect over curves that mean nothing, given the number of names; chosen
+ODDS_OVER_CURVES = 3.0  # of an effect over curves that mean nothing, given the number of names; chosen
 MIN_SHARE = 0.02  # of the misfit of its joint that an effect takes; chosen
 TYPICAL_SHARE = 0.1  # of a torque's root mean square, about which the sizes of curves are sought; chosen
 SHAPE_STEP = 0.03  # relative step of the slope by a shape; chosen
@@ -63,15 +63,8 @@ def _phase(e: PlacedEffect) -> str | None:
 class Search:
     """Adds effects to a fit as long as one is worth it."""
 
-    def __init__(
-        self,
-        model: Model,
-        rows: Sequence[TorqueRows],
-        filter: Filter,
-        X: np.ndarray,
-        runner: CallRunner = run_in_turn,
-    ) -> None:
-        self.model, self.rows, self.filter, self.X, self.runner = model, rows, filter, X, runner
+    def __init__(self, model: Model, rows: Sequence[TorqueRows], filter: Filter, X: np.ndarray) -> None:
+        self.model, self.rows, self.filter, self.X = model, rows, filter, X
         self.torques = [needed_torques(model, r, X) for r in rows]
         self.duration = max(float(r.t[-1]) for r in rows)
         # trial values of the machine at the speeds of the logs, whatever rate its file gives for the friction's turn
@@ -134,12 +127,14 @@ class Search:
             group[one.columns] = k
         return found, group, tuple(f"{one.kind} {one.channel}" for one in basis.components)
 
-    def form(self, fit: TorqueFit, found: Sequence[Candidate] | None = None) -> Form:
-        """Return the form of parameters and a fit's effects, of curves, and of candidates, all by default."""
+    def form(self, fit: TorqueFit, found: Sequence[Candidate] | None = None, curves: bool = True) -> Form:
+        """Return the form of parameters and a fit's effects, of candidates, all by default, and of curves if asked."""
         found = self.candidates if found is None else score_test.renumber_columns(found)
         columns = self.candidate_columns if found is self.candidates else self._columns(found)
-        Z = np.concatenate([fit.whitened_design, *(fit.whiten_all(x) for x in (self.curves, columns))], axis=1)
-        o, first = fit.whitened_design.shape[1], fit.whitened_design.shape[1] + len(self.group)
+        group, groups = (self.group, self.groups) if curves else (self.group[:0], ())
+        beside = [self.curves, columns] if curves else [columns]
+        Z = np.concatenate([fit.whitened_design, *map(fit.whiten_all, beside)], axis=1)
+        o, first = fit.whitened_design.shape[1], fit.whitened_design.shape[1] + len(group)
         Z[:, :o] /= np.maximum(np.linalg.norm(Z[:, :o], axis=0), 1e-300)
         A, b = Z.T @ Z, Z.T @ fit.whitened_torques
         left = Z[:, first:] - fit.basis @ (fit.basis.T @ Z[:, first:])
@@ -148,9 +143,9 @@ class Search:
         likeliest = np.abs(left.T @ fit.innovations) / np.maximum(square, 1e-300)
         likeliest[absorbed], absorbed = 0.0, absorbed + first
         A[absorbed], A[:, absorbed], b[absorbed] = 0.0, 0.0, 0.0
-        std = [evidence.amount_std(self.machine, x.placed, self.duration) for x in found for _ in x.columns]
+        std = evidence.amount_stds(self.machine, found, self.duration)
         # a prior with heavy tails: what is larger than usual costs no more than its width
-        return Form(A, b, o, self.group, self.groups, tuple(found), np.maximum(std, likeliest))
+        return Form(A, b, o, group, groups, tuple(found), np.maximum(std, likeliest))
 
     def settle(self, fit: TorqueFit, x: Candidate, factor: np.ndarray) -> PlacedEffect | None:
         """Return a candidate with the magnitude and the phase that its factors stand for; None if of a wrong sign.
@@ -169,9 +164,8 @@ class Search:
         for reach in REACHES:
             amounts = placed.values["A"] * 2 ** (reach * NEARBY)
             tried = [replace(placed, values={**placed.values, "A": float(x)}) for x in amounts]
-            form = self.form(fit, [Candidate(x, (0,)) for x in tried]).reduced()
-            at = np.arange(len(self.group), len(form.right_side))
-            placed = tried[int(np.argmax(2 * form.right_side[at] - np.diag(form.information)[at]))]
+            form = self.form(fit, [Candidate(x, (0,)) for x in tried], curves=False).reduced()
+            placed = tried[int(np.argmax(2 * form.right_side - np.diag(form.information)))]
         return placed
 
     def term(self, placed: PlacedEffect) -> Term:
@@ -191,7 +185,7 @@ class Search:
     def refined(self, fit: TorqueFit, found: evidence.Chosen) -> list[Term]:
         """Return chosen candidates as terms, with refined shapes."""
         stage = selection.Scored(self.machine, self.duration, lambda own, runner: self.form(fit, own))
-        found = selection.refined(stage, found, self.runner)
+        found = selection.refined(stage, found, run_in_turn)
         settled = [self.settle(fit, x, f) for x, f in zip(found.candidates, found.factors, strict=True)]
         return [self.term(x) for x in settled if x is not None]
 
@@ -206,14 +200,9 @@ class Search:
         tried = {frozenset[str]()}
         while not deadline.is_over():
             report(0.2 + 0.6 * len(reasons) / (len(reasons) + len(fit.terms) + 5), "testing effects on the torques")
-            form, known = self.form(fit), {t.name for t in fit.terms}
-            form = replace(
-                form, candidates=tuple(x for x in form.candidates if x.name not in known and x.name not in reasons)
-            )
-            if curves:
-                chosen = evidence.choose(form, odds=MIN_ODDS, most=1)
-            else:
-                chosen = evidence.choose(form.without_groups(), most=1)
+            form, out = self.form(fit, curves=curves), {t.name for t in fit.terms} | reasons.keys()
+            form = replace(form, candidates=tuple(x for x in form.candidates if x.name not in out))
+            chosen = evidence.choose(form, odds=ODDS_OVER_CURVES if curves else evidence.MIN_ODDS, most=1)
             if not chosen.candidates:
                 break
             new = fit.with_terms([*fit.terms, *self.refined(fit, chosen)])
@@ -243,7 +232,7 @@ class Search:
 
     def gain(self, rest: TorqueFit, placed: PlacedEffect) -> float:
         """Return the gain of an effect beside a fit: twice the logarithm of a Bayes factor."""
-        form = self.form(rest, [Candidate(placed, (0,))]).reduced()
+        form = self.form(rest, [Candidate(placed, (0,))], curves=False).reduced()
         return evidence.posterior(form, form.candidates, form.nothing, 0).gain
 
     def rivals(self, fit: TorqueFit, term: Term) -> tuple[EffectEntry, ...]:
@@ -251,7 +240,7 @@ class Search:
         rest = fit.without(term)
         own = self.gain(rest, term.effect)
         margin = 2 * np.log(evidence.CREDIBLE_ODDS) + selection.formula_ratio(own)
-        form = self.form(rest).reduced()
+        form = self.form(rest, curves=False).reduced()
         gains = evidence.first_gains(form, (), form.nothing)
         known = {t.name for t in fit.terms}
         best = [form.candidates[k] for k in evidence.best_of_each(form, gains, lambda x: x.name, 0.0)]
