@@ -94,9 +94,13 @@ class InfeasibleError(ExciteError, ValueError):
 
 
 class StoppedError(ExciteError):
-    """Work that was stopped (Ctrl-C) before it had a result; the message says how far it was."""
+    """Work that was stopped (Ctrl-C) before it had a result. why: how far it was, or what it has not yet."""
 
     exit_code = 130  # as shells have it
+
+    def __init__(self, why: str) -> None:
+        super().__init__(f"interrupted, nothing was written: {why}")
+        self.why = why
 
 
 class ServeError(FailedError):

@@ -33,14 +33,6 @@ def identify(
     machine: MachineArgument,
     logs: LogsArgument,
     method: MethodOption = None,
-    filtering: Annotated[
-        str,
-        typer.Option(
-            "--filter",
-            help="smoothing of noisy signals before they are differentiated; machine: cut-off frequency of the machine"
-            " file, auto: chosen from the logs",
-        ),
-    ] = "machine",
     validate: Annotated[
         list[Path] | None, typer.Option("--validate", help="log that is predicted, not fitted (repeatable)")
     ] = None,
@@ -62,13 +54,11 @@ def identify(
     from excite.model.machine import load_machine
 
     out = out or Path(f"results/identify-{load_machine(machine).name}")
-    _check_logs_and_filter(logs, filtering)
+    _require_different(logs)
     inputs = [*machine_file(machine), *logs, *(validate or [])]
     inputs += [unloaded] if unloaded else []
     with result_folder(out, json, partial(terminal.show, "identify"), inputs) as (place, summary):
-        summary |= workflows.identify(
-            place, machine, logs, method, filtering, validate or [], terminal.bar, unloaded, accept
-        )
+        summary |= workflows.identify(place, machine, logs, method, validate or [], terminal.bar, unloaded, accept)
     if summary["status"] == "invalid":
         raise typer.Exit(1)
 
@@ -77,8 +67,7 @@ def identify(
 def predict(
     result: Annotated[Path, typer.Argument(metavar="RESULT", help="folder that `excite identify` wrote")],
     target: Annotated[
-        Path,
-        typer.Argument(metavar="TARGET", help="a log, or a profile.csv (its columns tell), or a design's folder"),
+        Path, typer.Argument(metavar="TARGET", help="a log, or a profile.csv (its columns tell), or a design's folder")
     ],
     out: OutOption = None,
     json: JsonOption = False,
@@ -102,14 +91,6 @@ def predict(
 def diagnose(
     machine: MachineArgument,
     logs: LogsArgument,
-    filtering: Annotated[
-        str,
-        typer.Option(
-            "--filter",
-            help="smoothing of noisy signals before the first guess; machine: cut-off frequency of the machine file,"
-            " auto: chosen from the logs",
-        ),
-    ] = "machine",
     design_next: Annotated[
         bool,
         typer.Option(
@@ -147,21 +128,18 @@ def diagnose(
     from excite.model.machine import load_machine
 
     out = out or Path(f"results/diagnose-{load_machine(machine).name}")
-    _check_logs_and_filter(logs, filtering)
+    _require_different(logs)
     with result_folder(out, json, partial(terminal.show, "diagnose"), [*machine_file(machine), *logs]) as (
         place,
         summary,
     ):
-        summary |= workflows.diagnose(
-            place, machine, logs, filtering, design_next, terminal.bar, budget, accept, false_alarms
-        )
+        summary |= workflows.diagnose(place, machine, logs, design_next, terminal.bar, budget, accept, false_alarms)
 
 
 @commands.command(cls=DrawingCommand)
 def slip(
     table: Annotated[
-        Path | None,
-        typer.Argument(metavar="[TABLE]", help=f"forces of a wheel at some slips ({ENDINGS})"),
+        Path | None, typer.Argument(metavar="[TABLE]", help=f"forces of a wheel at some slips ({ENDINGS})")
     ] = None,
     column: Annotated[
         list[str] | None,
@@ -319,11 +297,9 @@ def convert_log(
         terminal.say(f"- {line}")
 
 
-def _check_logs_and_filter(logs: Sequence[Path], filtering: str) -> None:
-    """Raise UsageError for a log given twice or an unknown filter."""
+def _require_different(logs: Sequence[Path]) -> None:
+    """Raise UsageError for a log given twice."""
     from excite import output
-    from excite.identification import FILTERS
 
-    workflows.require_known("--filter", filtering, tuple(FILTERS))
     if len({*map(output.real, logs)}) < len(logs):
         raise UsageError("LOG: the same file is given twice, which would count it twice")

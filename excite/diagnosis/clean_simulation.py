@@ -19,14 +19,7 @@ from excite.diagnosis.residuals import concentrations, residuals_of_logs
 from excite.errors import SimulationError
 from excite.logs import Log
 from excite.simulation import Motion
-from excite.smoothing import (
-    ACCEPTABLE_STEP,
-    Fit,
-    StateSpace,
-    Trajectory,
-    fit_logs,
-    prepare_logs,
-)
+from excite.smoothing import ACCEPTABLE_STEP, Fit, StateSpace, Trajectory, fit_logs, prepare_logs
 from excite.text import format_number
 
 RUNS = 2  # simulated logs, which runs of two processes give in the time of one; chosen

@@ -237,12 +237,7 @@ def _make_finding(
     at_shapes = float(np.linalg.norm([at_shapes, FORMULA_STD_SHARE * amount, formula]))
     sure = float(
         np.linalg.norm(
-            [
-                sure,
-                FORMULA_STD_SHARE * amount,
-                formula,
-                magnitude_interval.std_over_weak_shapes(placed, after, runner),
-            ]
+            [sure, FORMULA_STD_SHARE * amount, formula, magnitude_interval.std_over_weak_shapes(placed, after, runner)]
         )
     )
     shapes = {

@@ -206,7 +206,7 @@ def _find_differences(model: Model, logs: Sequence[Log], filter: Filter) -> Agre
         every = [x for x in alone if x is not None]
         agreement = identification.compare_logs(tuple(groups), every) if len(every) == len(groups) else None
         return None if agreement is None or agreement.agree else agreement
-    agreement, estimates = identification.compare_sources(model, logs, "joint", filter, explained=True)
+    agreement, estimates = identification.compare_sources(model, logs, "joint", filter)
     if agreement is None or agreement.agree or any(e.status != "valid" for e in estimates):
         return None
     return agreement
@@ -272,11 +272,7 @@ def summarise(a: Assessment) -> dict[str, Any]:
         "share_explained": d.share,
         "remainder": _remainder_row(a.remainder),
         "located": list(a.located),
-        "nearest": {
-            "effect": d.nearest.name,
-            "share": d.nearest.share,
-            "impossible": list(d.nearest.impossible),
-        }
+        "nearest": {"effect": d.nearest.name, "share": d.nearest.share, "impossible": list(d.nearest.impossible)}
         if d.nearest
         else None,
         "parameters": parameter_table(d),

@@ -202,9 +202,7 @@ class ExtendedFit:
             data.space, self.measurements, fit.trajectories, fit.X, data.starts, fit.unidentifiable, fit.unknown
         )
         if found is None:
-            raise NotConvergedError(
-                "joint smoothing: a fit cannot be linearised: check the log with `excite log check`"
-            )
+            raise NotConvergedError("a fit cannot be linearised: check the log with `excite log check`")
         return without_smoother_levels(found)
 
     def release(self) -> None:

@@ -15,7 +15,6 @@ from .bias import (
 from .consistency import possible_standard as possible_standard
 from .delays import describe_late_channels as describe_late_channels
 from .estimate import Discrepancy as Discrepancy, Estimate as Estimate, FitTest as FitTest, widen as widen
-from .filter_choice import FILTERS as FILTERS
 from .identifiability import parameters_at_rest as parameters_at_rest
 from .inverse_estimate import recommend_method as recommend_method
 from .joint import (

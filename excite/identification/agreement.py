@@ -57,17 +57,18 @@ class Agreement:
 
 
 def compare_sources(
-    model: Model, logs: Sequence[Log], method: str, filter: Filter, explained: bool = False
+    model: Model, logs: Sequence[Log], method: str, filter: Filter
 ) -> tuple[Agreement | None, list[Estimate]]:
     """Identify each file of logs by itself and compare the estimates.
 
-    Return no comparison and no estimates for one file, or if one of them gives no estimate. explained: see `identify`.
+    Return no comparison and no estimates for one file, if one of them gives no estimate, or if the method knows that
+    the model alone does not explain one: what it lacks may differ as well.
     """
     groups = group_by_file(logs)
     if len(groups) < 2:
         return None, []
     try:
-        estimates = [identify(model, group, method, filter, explained) for group in groups.values()]
+        estimates = [identify(model, group, method, filter, explained=True) for group in groups.values()]
     except NoEstimateError:
         return None, []
     return compare_logs(tuple(groups), estimates), estimates

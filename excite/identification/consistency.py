@@ -63,37 +63,52 @@ def constrained_estimate(model: Model, estimate: Estimate, blocks: Sequence[Bloc
 def possible_standard(model: Model, estimate: Estimate) -> tuple[dict[str, float], str | None]:
     """Return the standard parameters [SI] by name of a possible machine with the estimated torques, and a note.
 
-    Of all machines hardly further from the estimate than the nearest possible one, it is the nearest to the machine
-    file, relative to the size of each parameter. If a joint's torques differ from the estimated ones, the note says how
-    much; otherwise it is None. Raises NotConsistentError.
+    Of all machines with the estimated base parameters, it is the nearest to the machine file, relative to the size of
+    each parameter; if none is possible, of those hardly further from the estimate than the nearest one. If torques of a
+    joint differ from the estimated ones, the note says of which and how much; otherwise it is None. Raises
+    NotConsistentError.
     """
     distance, _ = _nearest(model, estimate)
     scaled, by_name, base = _variables(model)
     nominal = np.array([v for v, _ in standard_parameters(model.machine).values()]) / _scales(model)
+    kept = _identified(estimate)
+    size = np.abs(model.base.matrix * _scales(model)).max(axis=1)
+    same = (base[kept] - estimate.value[kept]) / size[kept] == 0
     # half the margin, and hardly further: the nearest machine lies inside, as the solver needs it
     near = cp.norm(_shift(model, estimate, base)) <= distance + NOTABLE_SHIFT * (1 + distance)
     possible = _possibility_constraints(model, by_name, INTERIOR_MARGIN / 2)
-    if not _solved(cp.Problem(cp.Minimize(cp.norm(scaled - nominal)), [near, *possible])):
+    for goal in (same, near) if distance < NOTABLE_SHIFT else (near,):
+        if _solved(cp.Problem(cp.Minimize(cp.norm(scaled - nominal)), [goal, *possible])):
+            break
+    else:
         raise NotConsistentError("no possible machine found near the estimate")
     standard = {name: float(x.value) for name, x in by_name.items()}
     wanted = np.where(np.isfinite(estimate.value), estimate.value, np.asarray(base.value))
-    gap = _torque_gap(model, np.asarray(base.value), wanted)
-    if gap < SAME_TORQUES:
+    gaps = _torque_gaps(model, np.asarray(base.value), wanted)
+    if max(gaps.values()) < SAME_TORQUES:
         return standard, None
+    worst = ", ".join(f"{format_number(100 * x, 2)} % in {q}" for q, x in gaps.items() if x >= SAME_TORQUES)
     return standard, (
         f"no real machine has the identified values: the nearest possible one is written, {distance:.1f} standard"
-        f" deviations away; its torques differ by {format_number(100 * gap, 2)} % in a joint (rms over random motions)"
+        f" deviations away; its torques differ by {worst} (rms over random motions)"
     )
 
 
-def _torque_gap(model: Model, X: np.ndarray, wanted: np.ndarray) -> float:
-    """Return by how much torques of base parameters X (n_base,) differ from those wanted, of their rms in a joint."""
+def _torque_gaps(model: Model, X: np.ndarray, wanted: np.ndarray) -> dict[str, float]:
+    """Return by coordinate how far torques of base parameters X (n_base,) are from those wanted, of their rms.
+
+    The larger gap of two: torques of the bodies, and those of friction and all else, which would hide light bodies.
+    """
     rng = np.random.default_rng(0)
     n = len(model.coordinates)
     beside = [np.zeros((x.numel(), RANDOM_MOTIONS)) for x in model.effect_symbols()]
     W = model.stacked_regressor(*rng.uniform(-1, 1, (3, n, RANDOM_MOTIONS)), *beside)
-    gap, size = (np.linalg.norm(W @ x, axis=0) for x in (X - wanted, wanted))
-    return float((gap / np.maximum(size, max(INTERIOR_MARGIN * size.max(), np.finfo(float).tiny))).max())
+    bodies = [model.base.standard[k].rstrip("0123456789") in INERTIAL for k in model.base.independent]
+    gaps = np.zeros(n)
+    for part in (np.array(bodies), ~np.array(bodies)):
+        gap, size = (np.linalg.norm(W[:, :, part] @ x[part], axis=0) for x in (X - wanted, wanted))
+        gaps = np.maximum(gaps, gap / np.maximum(size, max(1e-9 * size.max(), np.finfo(float).tiny)))  # not rounding
+    return dict(zip(model.coordinates, gaps.tolist(), strict=True))
 
 
 def _nearest(model: Model, estimate: Estimate) -> tuple[float, np.ndarray]:
@@ -174,11 +189,7 @@ def _pseudo_inertia(parameters: dict[str, cp.Expression]) -> tuple[cp.Expression
     xx, yy, zz = at("XX"), at("YY"), at("ZZ")
     half = (xx + yy + zz) / 2
     second = cp.bmat(
-        [
-            [half - xx, -at("XY"), -at("XZ")],
-            [-at("XY"), half - yy, -at("YZ")],
-            [-at("XZ"), -at("YZ"), half - zz],
-        ]
+        [[half - xx, -at("XY"), -at("XZ")], [-at("XY"), half - yy, -at("YZ")], [-at("XZ"), -at("YZ"), half - zz]]
     )
     h = cp.reshape(cp.hstack([at("MX"), at("MY"), at("MZ")]), (3, 1), order="C")
     return at("M"), h, second

@@ -27,11 +27,11 @@ from excite.smoothing import (
     MAX_IDENTIFIABLE_STD,
     Fit,
     Measurements,
-    Missing,
     NotConvergedError,
     Settings,
     StateSpace,
     Trajectory,
+    average_over_sizes,
     build_state_space,
     common_sensors,
     describe_missing,
@@ -109,9 +109,14 @@ def joint_beside_forces(model: Model, logs: Sequence[Log], filter: Filter) -> Es
     if missing:
         parts = [f"{m.name.replace('_', ' ')} {format_number(m.rms, 2)} {m.unit}" for m in missing]
         notes = (*notes, f"what the model does not explain, rms along the logs: {'; '.join(parts)}")
+    found = average_over_sizes(space, found)
     estimate = _build_estimate(space, around.measurements, found, filter, notes)
-    moving = "" if found.step <= ACCEPTABLE_STEP else f"; {STALLED_DOUBT.format(format_number(found.step, 2))}"
-    return replace(estimate, doubt=UNEXPLAINED_DOUBT + moving, discrepancy=_discrepancy(missing))
+    stalled = (
+        f"; no better values were found, yet the next step is {format_number(found.step, 2)} standard deviations long"
+    )
+    doubt = UNEXPLAINED_DOUBT + (stalled if found.step > ACCEPTABLE_STEP else "")
+    discrepancy = tuple(Discrepancy(m.place, m.follows, m.rms, m.unit, m.scale) for m in missing)
+    return replace(estimate, doubt=doubt, discrepancy=discrepancy)
 
 
 def _limited(measurements: Sequence[Measurements]) -> Settings:
@@ -126,14 +131,6 @@ def _prepare(
     space = build_state_space(model, common_sensors(model, logs), bool(model.machine.contacts))
     measurements, starts = prepare_logs(space, logs, filter, unbiased=True)
     return space, measurements, starts, identifiability.parameters_at_rest(model, logs, filter, slow=False)
-
-
-def _discrepancy(missing: Sequence[Missing]) -> tuple[Discrepancy, ...]:
-    """Return what is missing as an estimate states it: place, what it follows, rms and unit."""
-    return tuple(Discrepancy(m.place, m.follows, m.rms, m.unit, m.scale) for m in missing)
-
-
-STALLED_DOUBT = "no better values were found, yet the next step is {} standard deviations long"
 
 
 def shows_sticking(model: Model, logs: Sequence[Log], filter: Filter, fit: Fit) -> bool:

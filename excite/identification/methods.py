@@ -20,7 +20,7 @@ from excite.identification.inverse_estimate import inverse
 from excite.identification.joint import UnexplainedError, joint, joint_beside_forces, joint_exactly
 from excite.identification.linear_methods import filtered_blocks, ols
 from excite.identification.status import assess
-from excite.logs import NEEDED, Log, doubts_in_errors, examine, planar_speed_sensors, samples, unmeasured
+from excite.logs import Log, doubts_in_errors, examine, is_needed, planar_speed_sensors, samples, unmeasured
 from excite.model import Model, with_given_zeros
 from excite.model.machine import Filter
 from excite.simulation import outside_law
@@ -114,7 +114,7 @@ def identify(
         estimate = replace(estimate, share_outside_law=_share_outside_law(model, repaired, filter, estimate))
     ratios = (RATIOS_NOTE.format(model.machine.torque_unit),) if model.machine.in_ratios else ()
     if ratios and not model.calibration:
-        ratios = (f"{ratios[0]}, or call a load known to get that constant",)
+        ratios = (f"{ratios[0]}, or call a load known (mass and com) to get that constant",)
     unused = unused_sensors(model, method, repaired)
     said = [f"{method} does not use {', '.join(unused)}"] if unused else []
     return add_notes(estimate, *ratios, *said, *(note for e in examined for note in e.notes), *doubts)
@@ -263,7 +263,7 @@ def needed_sensors(model: Model, method: str) -> tuple[str, ...]:
     speed = () if METHODS[method].simulates else ("lateral_speed",)
     sensors = model.machine.sensors("full")
     planar = planar_speed_sensors(model, [s.name for s in sensors]).sensors if model.machine.planar else ()
-    return tuple(s.name for s in sensors if s.kind in (*NEEDED, *speed) or s in planar)
+    return tuple(s.name for s in sensors if is_needed(s, model.machine) or s.kind in speed or s in planar)
 
 
 def unused_sensors(model: Model, method: str, logs: Sequence[Log]) -> tuple[str, ...]:

@@ -67,7 +67,7 @@ def tolerances(machine: Machine) -> tuple[Tolerance, ...]:
     measured = {w: s.radius for w, s in wheels.items() if s.radius is not None}
     relative = {w: r.tolerance_or(general.radius * float(r)) / float(r) for w, r in measured.items()}
     add("radius", "measuring_wheel_radius", relative)
-    turns = machine.planar and not _straight(machine)
+    turns = machine.planar and machine.body[0].coordinates[2] not in machine.locked
     lateral = {w: s.lateral.tolerance_or(general.length) for w, s in wheels.items() if turns and s.lateral is not None}
     add("position", "measuring_wheel_position", lateral)
     lengths = {w: b.d.tolerance_or(general.length) for w, b in joints.items()}
@@ -84,11 +84,6 @@ def tolerances(machine: Machine) -> tuple[Tolerance, ...]:
 
 def _or(stated: float | None, default: float) -> float:
     return default if stated is None else stated
-
-
-def _straight(machine: Machine) -> bool:
-    """Tell if a machine on the ground keeps its heading."""
-    return machine.planar and machine.body[0].coordinates[2] in machine.locked
 
 
 def with_tolerances(model: Model, every: Sequence[Tolerance]) -> Model:

@@ -217,7 +217,7 @@ def _smoothed_parameter_band(
     linear = linearise_logs(space, [data], [trajectory], [start], X)
     if linear is None:
         raise NotConvergedError("the smoothed motion can't be linearised")
-    n, Z, rate = len(X), linear[0].chain.Z[1:, 1:], float(space.model.machine.sampling_hz)
+    n, Z, rate = len(X), linear[0].Z[1:, 1:], float(space.model.machine.sampling_hz)
     offsets = -np.linalg.pinv(Z[n:, n:]) @ Z[n:, :n]  # most likely offsets of the encoders for a step of parameters
     still = apply_step(space, data, trajectory, linear[0], np.zeros(len(Z)), X).sampled_torque_error
     variance = np.zeros_like(still.T)

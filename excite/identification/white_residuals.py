@@ -31,6 +31,7 @@ from excite.smoothing import (
     linearise_logs,
     prepare_measurements,
     smoothed_motion,
+    state_scale,
     torque_sensor,
     transfer_trajectory,
     whiten,
@@ -95,14 +96,16 @@ def white_residuals(
     white = whiten(chain)
     rate = float(model.machine.sampling_hz)
     q, nu, _, u, a = smoothed_motion(space, data, trajectory, X)
-    errors = courses(q, nu, a, lowpass(u.T, rate, filter).T)
-    torques, readings = _simulated_noise(space, data, trajectory, X)
+    errors = courses(q, nu, lowpass(a.T, rate, filter).T, lowpass(u.T, rate, filter).T)
+    torques, fall, readings = _simulated_noise(space, data, trajectory, X)
     C = errors.shape[2]
     inverse = np.concatenate([1 / chain.noise, np.zeros((1, chain.noise.shape[1]))])
     gain = np.concatenate([chain.gain, np.zeros((1, *chain.gain.shape[1:]))])
+    farther = _farther(space)
 
     def signatures(own: slice) -> tuple[np.ndarray, np.ndarray]:
         push = gain[own] @ (np.concatenate([errors[own], torques[own]], axis=2) * inverse[own, :, None])
+        push[:, :, C:] += farther @ gain[own] @ (fall[own] * inverse[own, :, None])
         return push, np.concatenate([np.zeros((len(push), white.E.shape[1], C)), readings[own]], axis=2)
 
     filtered = np.zeros((*white.E.shape[:2], C + SIMULATIONS), np.float32)
@@ -212,10 +215,27 @@ def row_residuals(
     )
 
 
+def _farther(space: StateSpace) -> np.ndarray:
+    """Return how much farther joints get where a torque falls by 1 within an interval than where it stays at its mean.
+
+    (n, n), by the speeds that a constant torque of 1 gives in the interval; of scaled states. A constant torque moves a
+    joint by half its change of speed times the interval; one that falls by 1 about the same mean, by a twelfth more.
+    """
+    scale, at, n_q = state_scale(space), list(space.index), len(space.model.coordinates)
+    farther = np.zeros((space.n, space.n))
+    for row, coordinate in enumerate(at):
+        if coordinate < n_q and coordinate + n_q in at:
+            speed = at.index(coordinate + n_q)
+            farther[row, speed] = scale[speed] / scale[row] / (12 * float(space.model.machine.sampling_hz))
+    return farther
+
+
 def _simulated_noise(
     space: StateSpace, data: Measurements, trajectory: Trajectory, X: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Simulate noise along a motion: mean torque errors of each interval (N, n_u, B) [N m], and readings (N, m, B).
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Simulate noise along a motion: of torques in each interval (N, n_u, B) [N m], and of readings (N, m, B).
+
+    Of a torque error, its mean in the interval, and how far it falls within.
 
     An encoder counts from a random start. Where an edge falls on another sample than in the log, the nearest one lends
     its error.
@@ -229,7 +249,7 @@ def _simulated_noise(
         for b in range(SIMULATIONS):
             readings[:, j, b] = _edge_errors(angle[:, j], data.noise.sensor[j], rng.uniform())
     at_samples = rng.standard_normal((N + 1, data.torque.shape[1], SIMULATIONS)) * data.noise.torque[:, None]
-    return (at_samples[1:] + at_samples[:-1]) / 2, readings
+    return (at_samples[1:] + at_samples[:-1]) / 2, at_samples[:-1] - at_samples[1:], readings
 
 
 def _edge_errors(angle: np.ndarray, count: float, start: float) -> np.ndarray:

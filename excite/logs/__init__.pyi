@@ -38,7 +38,7 @@ from .profile import (
     read_profile as read_profile,
     torque_column as torque_column,
 )
-from .repair import NEEDED as NEEDED, examine as examine, moves as moves
+from .repair import examine as examine, is_needed as is_needed, moves as moves
 from .slip_table import (
     SLIP_PER as SLIP_PER,
     SLIP_ROLES as SLIP_ROLES,

@@ -9,7 +9,9 @@ from excite.errors import LogError
 from excite.model.machine import Machine
 from excite.text import count
 
-OFF = ("", "0", "false", "off", "no", "nan", "none", "disabled")  # what an enabled_column says of rows to leave out
+# what an enabled_column says of rows to keep, and of rows to leave out
+ON = ("1", "true", "t", "y", "on", "yes", "enable", "enabled")
+OFF = ("", "0", "false", "f", "n", "off", "no", "nan", "none", "disable", "disabled")
 
 
 def as_meant(table: pd.DataFrame, machine: Machine, source: str) -> pd.DataFrame:
@@ -47,6 +49,11 @@ def _with_sign(column: pd.Series, name: str, bit: int, source: str) -> pd.Series
             f"{source}: row {row}, column {name}: {np.nanmax(value):g} has bits above its sign_bit {bit}; which bit is"
             " the sign?"
         )
+    if (value < 0).any():
+        raise LogError(
+            f"{source}: row {int(np.argmax(value < 0)) + 1}, column {name}: is negative, but a register with a sign_bit"
+            " is not: log it as an unsigned number, or leave out sign_bit if its sign is read already"
+        )
     signed = np.where(value >= 2.0**bit, 2.0**bit - value, value)
     return pd.Series(np.where(np.isfinite(value), signed, np.nan), column.index).where(
         column.notna() & np.isfinite(value), column
@@ -60,6 +67,9 @@ def _enabled(table: pd.DataFrame, name: str, source: str, notes: list[str]) -> p
     number = pd.to_numeric(table[name], errors="coerce")
     text = table[name].astype(str).str.strip().str.lower()
     on = (number != 0) & ~text.isin(OFF)
+    if (odd := on & number.isna() & ~text.isin(ON)).any():
+        cell = str(table[name][odd].iloc[0])[:30]
+        raise LogError(f"{source}: column {name}: {cell!r} says neither on nor off; write 1 or 0, or true or false")
     if not on.any():
         raise LogError(f"{source}: column {name}: no row is enabled")
     if on.all():

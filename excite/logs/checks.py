@@ -39,13 +39,8 @@ CUTOFFS = 10.0  # times the filter's cutoff at which a channel follows what the 
 ROUNDED_FINE = 2.0  # times the machine file's noise that rounding may add; chosen
 DECIMATION_PASS = 0.4  # of the rate after decimation, up to which its filter passes
 COARSE_SHARE = 0.02  # of an acceleration's mean square that may be due to rounding; chosen
-FILTERED = (
-    "angle",
-    "torque",
-    "wheel",
-    "forward_speed",
-    "lateral_speed",
-)  # kinds of sensor whose readings an estimate rests on
+# kinds of sensor whose readings an estimate rests on
+FILTERED = ("angle", "torque", "wheel", "forward_speed", "lateral_speed")
 ORDINALS = ("", "", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
 
 

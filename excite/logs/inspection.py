@@ -14,9 +14,9 @@ from excite.logs.filtered import too_slow
 from excite.logs.log import Log
 from excite.logs.plausibility import doubts
 from excite.logs.preparation import as_log, at_rate_of, on_one_clock, place_rows
-from excite.logs.record import Finding, Record, record_of
+from excite.logs.record import Record, record_of
 from excite.logs.refusal import caught, lookalike, stray_rows, unit_doubts, wrong_time_unit
-from excite.logs.repair import NEEDED, mended
+from excite.logs.repair import is_needed, mended
 from excite.logs.resampling import BRIDGED_STEPS
 from excite.logs.times import has_time, seconds
 from excite.model.machine import Machine, Sensor, load_machine, shipped_machines
@@ -115,7 +115,9 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
     if clock:
         faults.append(clock)
     elif not strays:
-        used = _as_used(table, record, machine, {*_accused(machine, seen), *unread}, faults, remarks)
+        faulty = {f.sensor for f in seen if f.kind == "fault"}
+        accused = {c for s in machine.sensors("full") for c in s.columns if s.name in faulty}
+        used = _as_used(table, record, machine, accused | {*unread}, faults, remarks)
         doubtful += _doubts_of_used(used, faults)
     unknown = [c.name for c in columns if not c.what and c.name not in log.columns_known(machine)]
     if unknown:
@@ -149,12 +151,6 @@ def _no_column(machine: Machine) -> str:
     )
 
 
-def _accused(machine: Machine, seen: Sequence[Finding]) -> set[str]:
-    """Return the columns of sensors with a fault."""
-    faulty = {f.sensor for f in seen if f.kind == "fault"}
-    return {c for s in machine.sensors("full") for c in s.columns if s.name in faulty}
-
-
 def _doubts_of_used(used: Sequence[tuple[Machine, Log, float]], faults: list[str]) -> list[str]:
     """Return what is doubtful about the stretches that are used, unless there are faults; add those that are slow."""
     faults += [line for own, _, _ in used if (line := too_slow(float(own.sampling_hz), own.filter))]
@@ -169,10 +165,11 @@ def _absent(table: pd.DataFrame, machine: Machine) -> tuple[list[str], list[str]
         if not missing:
             continue
         line = f"no column {', '.join(missing)} ({log.what_of(sensor, machine)}){lookalike(missing, table, machine)}"
-        if sensor.kind in NEEDED:
+        if is_needed(sensor, machine):
             absent.append(f"{line}; no method does without it")
         else:
-            lacking.append(line + ("; some methods need it" if "paper" in sensor.kits else "; optional"))
+            some = "paper" in sensor.kits and sensor.kind != "angle"  # an angle that is not needed follows another
+            lacking.append(line + ("; some methods need it" if some else "; optional"))
     return absent, lacking
 
 
@@ -215,6 +212,7 @@ def _signals(
             signals[" - ".join(sensor.columns)] = (c.t, c.x, machine.si_unit(sensor))
         elif sensor.column in table.columns:
             number = pd.to_numeric(table[sensor.column], errors="coerce").to_numpy(dtype=float)
+            number = np.where(np.abs(number) < log.LARGEST, number, np.nan)
             when = t if len(t) == len(number) else np.arange(len(number)) / float(machine.sampling_hz)
             signals[sensor.column] = (when, number, sensor.unit)
     return signals

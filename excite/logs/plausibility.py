@@ -445,7 +445,7 @@ def _scale(sensor: Sensor, body: Body, machine: Machine, torque: np.ndarray) -> 
         f" {most:g}"
     )
     if 0 < top < SMALL * most:
-        larger = THOUSAND.get(sensor.unit) if sensor.factor is None else None
+        larger = THOUSAND.get(sensor.unit) if sensor.factor is None and top > SMALL * most / 1000 else None
         if larger is None:
             return f"{said}: is its {'unit' if sensor.factor is None else 'factor'} in the machine file right?"
         return f'{said}: is it in {larger}? then write unit = "{larger}" for it in {own_file(machine)}'

@@ -18,7 +18,7 @@ from excite.logs.clocks import is_clock
 from excite.logs.files.common import UNCLEAR, UNITS_SAID, UNITS_UNKNOWN
 from excite.logs.files.layout import known_unit
 from excite.logs.log import Log
-from excite.logs.repair import NEEDED
+from excite.logs.repair import is_needed
 from excite.logs.resampling import SAME_RATE, Stretch, at_rate, even_stretches, slower
 from excite.logs.time_axis import Run, evenly, order_rows
 from excite.logs.times import absolute_seconds, has_time, refuse_swapped_dates, seconds
@@ -293,7 +293,7 @@ def _joined(sources: Sequence[Source], machine: Machine) -> list[Source]:
     files = [s for s in sources if not isinstance(s, Log)]
     if len(files) < 2:
         return list(sources)
-    needed = {c for s in machine.sensors("full") if s.kind in NEEDED for c in s.columns}
+    needed = {c for s in machine.sensors("full") if is_needed(s, machine) for c in s.columns}
     tables = [s if isinstance(s, pd.DataFrame) else log.table_of(s, machine) for s in files]
     own = [needed & set(table.columns) for table in tables]
     whole = any(columns == needed for columns in own)

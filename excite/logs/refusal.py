@@ -122,7 +122,7 @@ def unit_doubts(table: pd.DataFrame, machine: Machine) -> tuple[list[str], list[
                 f"the file says {unit} in column {name}, which is not a known unit, the machine file {named}: which is"
                 " right?"
             )
-    listed = f"the line below the header is taken for units, which are not known: {', '.join(unknown)}"
+    listed = f"the file's units are not known, those of the machine file are taken: {', '.join(unknown)}"
     return differ, [listed] if unknown else []
 
 
@@ -147,10 +147,11 @@ def wrong_time_unit(t: np.ndarray, machine: Machine) -> str:
         )
     least, span = log.fewest_rows(machine), float(np.ptp(t))
     if typical * rate < 1 / WRONG_RATE and span * rate < least <= len(t):
+        days = span * UNITS["day"][1] / UNITS[machine.time_unit][1]
+        unit = ": is it in another unit, such as min or day?" if days * rate > least else "."
         return (
             f"column {machine.time_column}: {len(t)} rows span {format_number(span, 4)} s only, at {rate:g} Hz"
-            f" at least {format_number(least / rate, 3)} s are needed: is it in another unit, such as min, h or day?"
-            " Give the time of each row in seconds"
+            f" at least {format_number(least / rate, 3)} s are needed{unit} Give the time of each row in seconds"
         )
     return ""
 

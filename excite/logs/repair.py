@@ -15,7 +15,12 @@ from excite.logs.record import Channel, Record, record_of_log
 from excite.model.machine import Machine, Sensor
 from excite.text import count, format_number
 
-NEEDED = ("angle", "torque", "wheel")  # kinds of sensor that no method does without
+
+def is_needed(sensor: Sensor, machine: Machine) -> bool:
+    """Tell if no method does without a sensor. The angle of a joint that moves with a measured one is optional."""
+    lead = machine.find(sensor.body).moves_with if sensor.kind == "angle" else None
+    angles = [s.body for s in machine.sensor if s.kind == "angle" and not s.is_rate]
+    return sensor.kind in ("torque", "wheel", "angle") and (lead is None or lead.joint not in angles)
 
 
 @dataclass(frozen=True)

@@ -24,13 +24,12 @@ from excite.text import count, format_number
 EVEN = 0.02  # relative deviation of a step from the usual one up to which rows are even; chosen
 DRIFTED = 0.5  # of a step by which even rows may leave an even clock; chosen
 SAME_RATE = 1e-4  # relative deviation of two rates of sampling that count as one: 0.1 deviation of a mass; chosen
-BRIDGED_STEPS = (
-    3.5  # usual steps from one reading to the next, up to which what is lost between is interpolated; chosen
-)
+BRIDGED_STEPS = 3.5  # usual steps between two readings, up to which what is lost is interpolated; chosen
 BRIDGED_S = 0.1  # [s] the most of a quarter period of the filter that is bridged as well; chosen
 THINNED = 1.5  # ratio of rates from which a slower one is made by averaging, not by interpolation; chosen
 SHORTEST_STRETCH_S = 2.0  # [s] of a log between two gaps that is worth using; chosen
 ORDINALS = {2: "second", 3: "third", 4: "fourth", 5: "fifth", 6: "sixth", 8: "eighth", 10: "tenth"}
+ON_CHANGE = 'if the logger writes a cell only where it changes, write blank_means = "unchanged" in the machine file'
 HELD_ROWS = 0.9  # share of changes of a channel in every n-th row, from which it is taken for held; chosen
 
 
@@ -49,6 +48,9 @@ class Stretch:
     sampled: dict[str, np.ndarray] = field(default_factory=dict)
     edges: dict[str, np.ndarray] = field(default_factory=dict)
     doubts: tuple[str, ...] = ()
+
+
+Spans = list[tuple[float, float]]  # from, to [s]
 
 
 def used_sensors(table: pd.DataFrame, machine: Machine) -> list[Sensor]:
@@ -75,12 +77,10 @@ def even_stretches(
         x = pd.to_numeric(part[name], errors="coerce").to_numpy(dtype=float)
         every = held_every(x[there[name]]) if by_column[name].resolution is None else 1
         if every > 1:
-            change = np.diff(x, prepend=np.nan) != 0
-            there[name] &= change
+            there[name] &= np.diff(x, prepend=np.nan) != 0
             notes.append(
                 f"{source}: column {name}: changes in every {ordinal(every)} row only: a"
-                f" {format_number(own_rate(run.t) / every, 3)} Hz signal that is held, used at the rows where it"
-                " changes"
+                f" {format_number(own_rate(run.t) / every, 3)} Hz signal that is held, used where it changes"
             )
     for name, rows in there.items():
         if not rows.any():
@@ -107,7 +107,7 @@ def even_stretches(
     kept = [(a, b) for a, b in spans if b - a >= min(SHORTEST_STRETCH_S, last - first)]
     if not kept:
         raise LogError(f"{source}: no stretch between gaps lasts {SHORTEST_STRETCH_S:g} s{_sparse(there)}")
-    notes += _notes(run.t, there, own, grid, spans, kept, source, first, last)
+    notes += [f"{source}: {said}" for said in _notes(run.t, there, own, grid, spans, kept, last - first)]
     return [_interpolated(part, run, there, machine, a, b, grid) for a, b in kept], notes
 
 
@@ -139,11 +139,7 @@ def _sparse(there: dict[str, np.ndarray]) -> str:
     name, rows = min(there.items(), key=lambda one: one[1].mean())
     if rows.all():
         return "; log without gaps"
-    blank = format_number(100 * (1 - float(rows.mean())), 2)
-    return (
-        f": column {name} is blank in {blank} % of the rows; if the logger writes a cell only where its value changes,"
-        ' write blank_means = "unchanged" in the machine file'
-    )
+    return f": column {name} is blank in {format_number(100 * float((~rows).mean()), 2)} % of the rows; {ON_CHANGE}"
 
 
 def _readings(column: pd.Series, name: str, source: str) -> np.ndarray:
@@ -193,14 +189,14 @@ def _drifts(t: np.ndarray) -> bool:
     return bool(np.abs(t - t[0] - step * np.arange(len(t))).max() > DRIFTED * step)
 
 
-def _holes(t: np.ndarray, longest: float) -> list[tuple[float, float]]:
+def _holes(t: np.ndarray, longest: float) -> Spans:
     """Spans between two readings that are further apart than what is bridged."""
     return [(float(t[k]), float(t[k + 1])) for k in np.flatnonzero(np.diff(t) > longest * (1 + EVEN))]
 
 
-def _between(first: float, last: float, holes: list[tuple[float, float]]) -> list[tuple[float, float]]:
+def _between(first: float, last: float, holes: Spans) -> Spans:
     """Return the spans of first..last between the holes."""
-    spans, at = list[tuple[float, float]](), first
+    spans, at = Spans(), first
     for a, b in holes:
         if a > at:
             spans.append((at, a))
@@ -269,34 +265,34 @@ def _interpolated(
     return Stretch(pd.DataFrame(columns), a, rate, first, bool(sampled or edges), sampled, edges)
 
 
+def _blanks(t: np.ndarray, there: dict[str, np.ndarray], steps: dict[str, float], grid: float) -> str:
+    """Say of which channels cells are blank, and what to do unless each has even times of its own."""
+    rates: dict[str, list[str]] = {}
+    for name, usual in steps.items():
+        rates.setdefault(f"{format_number(1 / usual, 3)} Hz" if usual > 0 else "one reading", []).append(name)
+    blank = {name: int((~rows).sum()) for name, rows in there.items() if not rows.all()}
+    missed = any(np.diff(t[there[name]]).max(initial=0.0) > 1.5 * steps[name] for name in blank)
+    if len(rates) > 1 or not missed:
+        listed = "; ".join(f"{', '.join(names)} at {rate}" for rate, names in rates.items())
+        said = f"channels with times of their own ({listed}), each interpolated onto {format_number(grid, 4)} Hz"
+    else:
+        listed = ", ".join(f"{n} in {name}" for name, n in blank.items())
+        said = f"{count(sum(blank.values()), 'empty cell')}, interpolated ({listed})"
+    return f"{said}; {ON_CHANGE}" if missed else said
+
+
 def _notes(
-    t: np.ndarray,
-    there: dict[str, np.ndarray],
-    own: float,
-    grid: float,
-    spans: list[tuple[float, float]],
-    kept: list[tuple[float, float]],
-    source: str,
-    first: float,
-    last: float,
+    t: np.ndarray, there: dict[str, np.ndarray], own: float, grid: float, spans: Spans, kept: Spans, common: float
 ) -> list[str]:
-    """Say what was done to uneven rows."""
+    """Say what was done to uneven rows; common [s]: time in which all channels have readings."""
     notes = []
     dt = np.diff(t)
     step, wide = 1 / own, dt[dt <= BRIDGED_STEPS / own]
-    rates: dict[str, list[str]] = {}
-    for name, rows in there.items():
-        usual = _usual_step(t[rows])
-        rates.setdefault(f"{format_number(1 / usual, 3)} Hz" if usual > 0 else "one reading", []).append(name)
+    steps = {name: _usual_step(t[rows]) for name, rows in there.items()}
     lost = int((wide > 1.5 * step).sum())
-    sparse = sum(int((~rows).sum()) for rows in there.values())
-    if len(rates) > 1 and sparse:
-        listed = "; ".join(f"{', '.join(names)} at {rate}" for rate, names in rates.items())
-        notes.append(
-            f"{source}: channels with times of their own ({listed}), each interpolated onto {format_number(grid, 4)} Hz"
-        )
-    elif sparse:
-        notes.append(f"{source}: {count(sparse, 'empty cell')}, interpolated")
+    sparse = not all(rows.all() for rows in there.values())
+    if sparse:
+        notes.append(_blanks(t, there, steps, grid))
     even = np.abs(wide / step - np.round(wide / step)).max() < 5 * EVEN if len(wide) else True
     drifting = not lost and not sparse and len(spans) == 1 and _drifts(t)
     if not even or drifting:
@@ -304,23 +300,20 @@ def _notes(
         slow = ", and the steps drift" if even else ""
         few, many = format_number(low, 3), format_number(high, 3)
         notes.append(
-            f"{source}: rows are {few if few == many else f'{few} to {many}'} ms apart{slow}, interpolated at"
+            f"rows are {few if few == many else f'{few} to {many}'} ms apart{slow}, interpolated at"
             f" their own times onto {format_number(1e3 / grid, 4)} ms"
         )
     elif lost and not sparse:
-        notes.append(f"{source}: rows are lost in {count(lost, 'place')}, interpolated")
+        notes.append(f"rows are lost in {count(lost, 'place')}, interpolated")
     if len(spans) > 1:
-        gaps = len(spans) - 1
         used = sum(b - a for a, b in kept)
         notes.append(
-            f"{source}: {count(gaps, 'gap')}: used are {len(kept)} of {len(spans)} stretches between,"
-            f" {format_number(used, 4)} of {format_number(last - first, 4)} s"
+            f"{count(len(spans) - 1, 'gap')}: used are {len(kept)} of {len(spans)} stretches between,"
+            f" {format_number(used, 4)} of {format_number(common, 4)} s"
         )
     whole = float(t[-1] - t[0])
-    longest = max((_usual_step(t[rows]) for rows in there.values()), default=0.0)
-    if whole - (last - first) > min(0.01 * whole, BRIDGED_STEPS * longest):
+    if whole - common > min(0.01 * whole, BRIDGED_STEPS * max(steps.values(), default=0.0)):
         notes.append(
-            f"{source}: not all channels last as long: used are {format_number(last - first, 4)} of"
-            f" {format_number(whole, 4)} s"
+            f"not all channels last as long: used are {format_number(common, 4)} of {format_number(whole, 4)} s"
         )
     return notes

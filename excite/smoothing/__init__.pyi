@@ -53,6 +53,7 @@ from .measurements import (
 from .sizes import (
     SIZE_SCATTER as SIZE_SCATTER,
     FitBeside as FitBeside,
+    average_over_sizes as average_over_sizes,
     fit_unknown_forces as fit_unknown_forces,
     lacks_forces as lacks_forces,
     sizes_step as sizes_step,

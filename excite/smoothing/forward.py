@@ -172,7 +172,7 @@ MAX_GROWTH = 1.0  # [1/s] that forces may add to a motion: what grows faster ove
 
 
 def _direct_slopes(space: StateSpace, at: Evaluation, n_p: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the slopes (N, m, n_d) of readings by what they depend on directly, and its columns (n_d,) in a chain."""
+    """Return the slopes (N, m, n_d) of readings by what they depend on directly, and its columns (n_d,) in `drive`."""
     parameters, readings, shape = list(space.reading_parameters), at.lacking.readings, at.residual.shape
     seen = sorted({int(c) for term in readings for c in term.columns})
     by_coefficient = np.zeros((*shape, len(seen)))
@@ -187,30 +187,18 @@ def _direct_slopes(space: StateSpace, at: Evaluation, n_p: int) -> tuple[np.ndar
 
 
 def linearise(space: StateSpace, at: Evaluation, guess: np.ndarray, X: np.ndarray) -> LinearisedLog:
-    """Linearise an evaluated log and integrate out its states."""
+    """Linearise an evaluated log."""
     data, trajectory, lacking = at.data, at.trajectory, at.lacking
     scale, n_p, n_u, N = state_scale(space), len(X), data.torque.shape[1], len(trajectory.state)
     count = 1 + n_p + lacking.count + len(data.offset_sensors)
     S, (direct, columns) = at.H * scale, _direct_slopes(space, at, n_p)
-    first = np.zeros((1, space.n, count))
-    first[0, :, 0] = (guess - trajectory.state[0]) / scale
     std = initial_std(space) / scale
     zero = np.zeros((1, space.n, space.n))
-    sections = [
-        parallel_smoother.combine(
-            parallel_smoother.Elements(zero, first, np.diag(std**2)[None], np.zeros_like(first), zero)
-        )
-    ]
-    stages, gains, inverses = [], [], []
+    sections = [parallel_smoother.combine(parallel_smoother.Elements(zero, np.diag(std**2)[None], zero))]
+    elements, gains, inverses = [], [], []
     acting = np.concatenate([np.arange(n_u), n_u + np.flatnonzero(lacking.force_std > 0)])
-
-    def readings(part: slice) -> tuple[np.ndarray, np.ndarray]:
-        weighted = (S[part] * at.weight[part][:, :, None]).transpose(0, 2, 1)
-        eta = np.zeros((part.stop - part.start, space.n, count))
-        eta[:, :, 0] = (weighted @ at.residual[part][:, :, None])[:, :, 0]
-        eta[:, :, columns] = -(weighted @ direct[part])
-        return weighted @ S[part], eta
-
+    J = (S * at.weight[:, :, None]).transpose(0, 2, 1) @ S
+    drive = np.zeros((N, space.n, count))
     terms = [(t.columns, list(space.input_columns).index(t.at), t.values(at.features)) for t in lacking.inputs]
     feedback = feedback_of(space, at)
     for begin in range(0, N - 1, BATCH_SIZE):
@@ -220,43 +208,34 @@ def linearise(space: StateSpace, at: Evaluation, guess: np.ndarray, X: np.ndarra
         A, inverse = close(space, by, own_feedback)
         A = A * (scale / scale[:, None])
         gain = by.B[:, :, acting] * at.noise[begin:end, None, acting] / scale[:, None]
-        b = np.zeros((end - begin, space.n, count))
+        b = drive[begin:end]
         relative_error = at.error[begin:end, acting] / at.noise[begin:end, acting]
         b[:, :, 0] = at.defect[begin:end] / scale - (gain @ relative_error[:, :, None])[:, :, 0]
         b[:, :, 1 : 1 + n_p] = (by.X + by.B[:, :, :n_u] @ at.behind[begin:end]) * (space.model.scale / scale[:, None])
         for own, j, values in terms:
-            at_start, at_end = values[begin:end, None, :], values[begin + 1 : end + 1, None, :]
-            change = by.B[:, :, j, None] * at_start + by.rising[:, :, j, None] * (at_end - at_start)
-            b[:, :, 1 + n_p + own] += change / scale[:, None]
+            ends = np.stack([by.B[:, :, j] - by.rising[:, :, j], by.rising[:, :, j]], axis=2) / scale[:, None]
+            both = np.stack([values[begin:end], values[begin + 1 : end + 1]], axis=1)
+            b[:, :, 1 + n_p + own[0] : 2 + n_p + own[-1]] += ends @ both
         if inverse is not None:
             inverse = inverse * (scale / scale[:, None])
             inverses.append(inverse)
-            A, b, gain = (inverse @ x for x in (A, b, gain))
+            A, gain = inverse @ A, inverse @ gain
+            drive[begin:end] = inverse @ b
         C = gain @ gain.transpose(0, 2, 1)
         gains.append(gain)
-        for k in range(begin, end, PART_SIZE):
-            part_end = min(k + PART_SIZE, end)
-            J, eta = readings(slice(k, part_end))
-            inside = slice(k - begin, part_end - begin)
-            stages.append(parallel_smoother.Elements(A[inside], b[inside], C[inside], eta, J))
-            sections.append(parallel_smoother.combine(stages[-1]))
+        for k in range(0, end - begin, PART_SIZE):
+            part = slice(k, min(k + PART_SIZE, end - begin))
+            elements.append(parallel_smoother.Elements(A[part], C[part], J[begin:end][part]))
+            sections.append(parallel_smoother.combine(elements[-1]))
     # The last sample has no transition.
-    J, eta = readings(slice(N - 1, N))
-    none = np.zeros_like(J)
-    stages.append(parallel_smoother.Elements(none, np.zeros_like(eta), none, eta, J))
-    sections.append(parallel_smoother.combine(stages[-1]))
-    chain = parallel_smoother.smooth_chain(sections)
-    root = np.sqrt(at.weight)
-    where = np.concatenate([[0], columns])
-    flat = np.concatenate([(at.residual * root)[:, :, None], -direct * root[:, :, None]], axis=2)
-    flat = flat.reshape(-1, len(where))
-    Z = chain.Z.copy()
-    Z[np.ix_(where, where)] += flat.T @ flat
+    elements.append(parallel_smoother.Elements(zero, zero, J[-1:]))
+    sections.append(parallel_smoother.combine(elements[-1]))
     return LinearisedLog(
-        chain,
-        Z,
+        parallel_smoother.smooth_chain(sections),
+        drive,
+        (guess - trajectory.state[0]) / scale,
         np.concatenate(gains),
-        tuple(stages),
+        tuple(elements),
         S,
         at.weight,
         at.residual,
@@ -366,7 +345,7 @@ def move(
     data: Measurements,
 ) -> Trajectory:
     """Return the trajectory after a scaled step of all unknowns to parameters X, with its most likely states."""
-    x, slope = linear.chain.states(step)
+    x, slope = linear.states(step)
     e = (linear.gain.transpose(0, 2, 1) @ slope[1:, :, None])[:, :, 0] * linear.noise
     n_u, n_o = data.torque.shape[1], len(data.offset_sensors)
     n_c = lacking.count

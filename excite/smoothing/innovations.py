@@ -38,23 +38,25 @@ class FilterStep:
 
 @dataclass(frozen=True)
 class LinearisedLog:
-    """One log linearised about a trajectory, in scaled states, with its states integrated out.
+    """One log linearised about a trajectory, in scaled states; `Z` has its states integrated out.
 
-    chain: solution of the smoother. Z: twice the negative log-likelihood is [1 p]' Z [1 p] for scaled steps p of
-    parameters and offsets.
+    chain: combined elements of the smoother, the prior of the first state before them.
+    drive (N, n, c): what data and each scaled step of parameters, unknown forces and offsets add to the state after a
+    sample, zero after the last. start (n,): mean of the first state.
     gain (N - 1, n, n_e): effect of one standard deviation of each white error on the scaled state.
     elements: elements of the chain, part by part.
     H (N, m, n), weight, residual (N, m): slopes, 1 / variance and residual of the readings.
     direct (N, m, n_f + n_o): slopes of the readings by the parameters they depend on directly, and by offsets.
     noise (N - 1, n_e): standard deviation of the white errors: delivered torques [N m], then forces.
     beat_inflation (N, m): variance of the readings relative to 1 / weight where encoder errors beat.
-    direct_columns: columns of the chain that `direct` belongs to.
+    direct_columns: columns of `drive` that `direct` belongs to.
     acting (n_e,): places of the white errors in `gain` and `noise` among all torques and forces.
     closing (N - 1, n, n): what defects are multiplied by in the chain (`forward.close`), None if by one.
     """
 
     chain: parallel_smoother.SmoothedChain
-    Z: np.ndarray
+    drive: np.ndarray
+    start: np.ndarray
     gain: np.ndarray
     elements: tuple[parallel_smoother.Elements, ...]
     H: np.ndarray
@@ -66,6 +68,28 @@ class LinearisedLog:
     acting: np.ndarray
     direct_columns: np.ndarray
     closing: np.ndarray | None = None
+
+    @cached_property
+    def Z(self) -> np.ndarray:
+        """Matrix (c, c): for steps p, twice the negative log-likelihood is [1 p]' Z [1 p], states integrated out."""
+        return information(self)
+
+    def states(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the most likely states and slopes (N, n) for a step p (c - 1,), see `SmoothedChain.states`."""
+        found = self._states_for(np.concatenate([[1.0], p])[:, None])
+        return found[0][:, :, 0], found[1][:, :, 0]
+
+    def state_slopes(self, of: slice) -> np.ndarray:
+        """Return the derivatives of the most likely states by some of p (N, n, w)."""
+        return self._states_for(np.eye(self.drive.shape[2])[:, 1:][:, of])[0]
+
+    def _states_for(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the most likely states and slopes (N, n, w) for weights (c, w) of the data and p."""
+        first = self.start[:, None] * weights[:1]
+        reading = self.residual[:, :, None] * weights[:1] - self.direct @ weights[self.direct_columns]
+        pull = self.H.transpose(0, 2, 1) @ (self.weight[:, :, None] * reading)
+        none = np.zeros_like(first)[None]
+        return self.chain.states(np.concatenate([first[None], self.drive @ weights]), np.concatenate([none, pull]))
 
     @cached_property
     def innovations(self) -> np.ndarray:
@@ -91,15 +115,21 @@ class LinearisedLog:
 def innovations(linear: LinearisedLog) -> np.ndarray:
     """Compute the innovations (N, m), each over its standard deviation; NaN where a reading is unused."""
     normalised = np.full(linear.residual.shape, np.nan)
-    state = _state_means(linear)
-    drift = np.concatenate([stages.b[:, :, :1] for stages in linear.elements])
+    white = np.concatenate([E for E, _, _ in _whitened(linear, 1)])
     for step in linear.filter:
-        innovation = linear.residual[step.samples, :, None] - linear.H[step.samples] @ state[step.parts, :, None]
-        normalised[step.samples] = np.where(step.used, innovation[:, :, 0] / np.sqrt(step.variance), np.nan)
-        state[step.parts] = (step.A @ (state[step.parts, :, None] + step.gain @ innovation) + drift[step.samples])[
-            :, :, 0
-        ]
+        innovation = np.linalg.solve(step.whitening, white[step.samples, :, :1])[:, :, 0]
+        normalised[step.samples] = np.where(step.used, innovation / np.sqrt(step.variance), np.nan)
     return normalised
+
+
+def information(linear: LinearisedLog) -> np.ndarray:
+    """Compute Z (c, c) of a log with all states integrated out: products of the white innovations of its columns."""
+    count = linear.drive.shape[2]
+    Z = np.zeros((count, count))
+    for E, _, _ in _whitened(linear, count):
+        flat = E.reshape(-1, count)
+        Z += flat.T @ flat
+    return Z
 
 
 def log_variance(linear: LinearisedLog) -> float:
@@ -162,23 +192,29 @@ def whiten(linear: LinearisedLog) -> WhitenedInnovations:
 
     The products of the columns are the information about parameter steps with all states integrated out.
     """
-    (N, m, n), count = linear.H.shape, linear.chain.Z.shape[0]
-    E, start_response = np.empty((N, m, count), np.float32), np.empty((N, m, n), np.float32)
-    begin, transitions = linear.chain.parts[0].total.b[0], list[np.ndarray]()
+    found = list(_whitened(linear, linear.drive.shape[2]))
+    E, start_response = (np.concatenate([own[k].astype(np.float32) for own in found]) for k in (0, 1))
+    return WhitenedInnovations(E, start_response, np.concatenate([own[2] for own in found]))
+
+
+def _whitened(linear: LinearisedLog, count: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield E, start_response, transitions of `WhitenedInnovations` batch by batch, for the first columns."""
+    m, n = linear.H.shape[1:]
+    begin = np.zeros((n, count))
+    begin[:, 0] = linear.start
+    seen = linear.direct_columns < count
     for parts, samples in _batches(linear):
-        elements = linear.elements[parts]
         K = samples.stop - samples.start
         reading, push = np.zeros((K, m, count + n)), np.zeros((K, n, count + n))
         reading[:, :, 0] = -linear.residual[samples]
-        reading[:, :, linear.direct_columns] = linear.direct[samples]
-        push[:, :, :count] = np.concatenate([x.b for x in elements])
-        x = np.zeros((len(elements), n, count + n))
+        reading[:, :, linear.direct_columns[seen]] = linear.direct[samples][:, :, seen]
+        push[:, :, :count] = linear.drive[samples, :, :count]
+        x = np.zeros((parts.stop - parts.start, n, count + n))
         x[:, :, count:] = np.eye(n)
         filtered = _filter_columns(linear, parts, samples.start, x, push, reading)
-        E[samples], start_response[samples] = filtered[:, :, :count], filtered[:, :, count:]
-        transitions.append(x[:, :, count:])
-        begin = _join_parts(linear, parts, E[samples], start_response[samples], transitions[-1], x[:, :, :count], begin)
-    return WhitenedInnovations(E, start_response, np.concatenate(transitions))
+        E, start_response, transitions = filtered[:, :, :count], filtered[:, :, count:], x[:, :, count:]
+        begin = _join_parts(linear, parts, E, start_response, transitions, x[:, :, :count], begin)
+        yield E, start_response, transitions
 
 
 def whiten_signatures(
@@ -206,7 +242,7 @@ def _filter_columns(
     x (parts, n, k): states at the start of each part, overwritten by those at its end. push (K, n, k), reading (K, m,
     k): inputs to states and readings. first: first sample of the parts.
     """
-    E = np.empty(reading.shape, np.float32)
+    E = np.empty_like(reading)
     for step in linear.filter:
         own = slice(*np.searchsorted(step.parts, (parts.start, parts.stop)))
         if own.start == own.stop:
@@ -236,34 +272,27 @@ def _join_parts(
     first = 0
     for k, elements in enumerate(linear.elements[parts]):
         own = slice(first, first + len(elements))
-        E[own] += start_response[own] @ begin.astype(np.float32)
+        E[own] += start_response[own] @ begin.astype(E.dtype)
         begin = ends[k] + transitions[k] @ begin
         first += len(elements)
     return begin
 
 
-def _state_means(linear: LinearisedLog) -> np.ndarray:
-    """Expected state at the start of each part (parts, n), from all readings before."""
-    return _predict_part_starts(linear)[0]
-
-
-def _predict_part_starts(linear: LinearisedLog) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (parts, n) and covariance (parts, n, n) of the state at the start of each part, from all readings before."""
+def _predict_part_starts(linear: LinearisedLog) -> np.ndarray:
+    """Return the covariance (parts, n, n) of the state at the start of each part, from all readings before."""
     parts, n = linear.chain.parts, linear.H.shape[2]
-    x, P = np.empty((len(linear.elements), n)), np.empty((len(linear.elements), n, n))
-    x[0], P[0] = parts[0].total.b[0, :, 0], parts[0].total.C[0]
+    P = np.empty((len(linear.elements), n, n))
+    P[0] = parts[0].total.C[0]
     for k, part in enumerate(parts[1:-1]):
-        element = part.total
-        update = np.linalg.inv(np.eye(n) + P[k] @ element.J[0])
-        x[k + 1] = element.A[0] @ (update @ (x[k] + P[k] @ element.eta[0, :, 0])) + element.b[0, :, 0]
-        P[k + 1] = element.A[0] @ update @ P[k] @ element.A[0].T + element.C[0]
-    return x, P
+        A, C, J = part.total.A[0], part.total.C[0], part.total.J[0]
+        P[k + 1] = A @ np.linalg.solve(np.eye(n) + P[k] @ J, P[k]) @ A.T + C
+    return P
 
 
 def filter_steps(linear: LinearisedLog) -> list[FilterStep]:
     """Compute the gains of the Kalman filter, step by step in all parts in parallel."""
     starts = np.cumsum([0, *(len(s) for s in linear.elements)])
-    P = _predict_part_starts(linear)[1]
+    P = _predict_part_starts(linear)
     largest_weight = linear.weight.max(axis=0)
     steps = []
     for j in range(max(len(s) for s in linear.elements)):
@@ -276,11 +305,11 @@ def filter_steps(linear: LinearisedLog) -> list[FilterStep]:
         S = h @ cross
         S = (S + S.transpose(0, 2, 1)) / 2
         S[:, range(h.shape[1]), range(h.shape[1])] += variance
-        gain = np.linalg.solve(S, cross.transpose(0, 2, 1)).transpose(0, 2, 1)
-        A, C = (np.stack([getattr(linear.elements[i], f)[j] for i in running]) for f in ("A", "C"))
-        posterior = P[running] - gain @ cross.transpose(0, 2, 1)
-        P[running] = A @ ((posterior + posterior.transpose(0, 2, 1)) / 2) @ A.transpose(0, 2, 1) + C
         whitening = np.linalg.inv(np.linalg.cholesky(S))
+        seen = cross @ whitening.transpose(0, 2, 1)
+        gain = seen @ whitening
+        A, C = (np.stack([getattr(linear.elements[i], f)[j] for i in running]) for f in ("A", "C"))
+        P[running] = A @ (P[running] - seen @ seen.transpose(0, 2, 1)) @ A.transpose(0, 2, 1) + C
         steps.append(
             FilterStep(samples, running, A, gain, whitening, np.diagonal(S, axis1=1, axis2=2).copy(), weight > 0)
         )

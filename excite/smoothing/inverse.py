@@ -1,8 +1,8 @@
 """Most likely parameters of a machine whose joints are all driven, with motions and discrepancies integrated out.
 
 The negative log-likelihood of motions and parameters is a nonlinear least-squares problem: readings of encoders,
-torques along the motion, the prior of white jerk, and priors of parameters and discrepancies. Gauss-Newton with
-Levenberg's damping eliminates the motions of each log; no step that raises the cost is taken. Sizes (jerk, noise,
+torques along the motion, the prior of smooth motions, and priors of parameters and discrepancies. Gauss-Newton with
+Levenberg's damping eliminates the motions of each log; no step that raises the cost is taken. Sizes (motion, noise,
 tails, discrepancies) maximise the marginal likelihood by MacKay's fixed point, and the slope of the motions' log
 determinant makes the parameters those of the marginal likelihood, which alone is unbiased.
 """
@@ -26,17 +26,17 @@ from excite.smoothing.discrepancy import Basis
 from excite.smoothing.inverse_chain import CHUNK, Chain, TorqueModel
 from excite.smoothing.log_fit import prior_terms
 from excite.smoothing.motion_readings import predicted, prior_terms_of_motion, reading_terms, start_cost
-from excite.smoothing.splines import ORDER, squared_jerk
+from excite.smoothing.splines import ORDER, roughness
 
 
 @dataclass(frozen=True)
 class NoiseSizes:
-    """Sizes that the data set: jerk (n,) by joint; noise (n,) and tails (n,) of torques; level by sensor.
+    """Sizes that the data set: intensity (n,) of motions; noise (n,) and tails (n,) of torques; level by sensor.
 
-    lively: of each log (K, n), the local jerk intensity relative to `jerk`.
+    lively: of each log (K, n), the local intensity relative to `intensity`.
     """
 
-    jerk: np.ndarray
+    intensity: np.ndarray
     noise: np.ndarray
     tails: np.ndarray
     level: dict[str, float]
@@ -70,7 +70,7 @@ class Problem:
     """Logs of one machine on knots, and how their parameters are sought.
 
     prior, held: information (n_base,) about the machine file's values, scaled.
-    shift_std [s]: of the alignment. least_noise (n,) [N m]: of torques.
+    shift_std [s]: of the alignment. least_noise (n,) [N m]: of torques. least_intensity (n,): of motions.
     """
 
     torque: TorqueModel
@@ -78,6 +78,7 @@ class Problem:
     prior: np.ndarray
     shift_std: float
     least_noise: np.ndarray
+    least_intensity: np.ndarray
 
     @property
     def model(self) -> Model:
@@ -161,11 +162,11 @@ def cost_of(
             own = coefficients[: chain.knots.size, j]
             total += float(
                 (
-                    squared_jerk(chain.knots, chain.near(own[:, None])[:, :, 0])[0]
-                    / (sizes.jerk[j] * sizes.lively[n][:, j])
+                    roughness(chain.prior[j], chain.near(own[:, None])[:, :, 0])[0]
+                    / (sizes.intensity[j] * sizes.lively[n][:, j])
                 ).sum()
             )
-            total += start_cost(chain.knots, chain.starts[j], own)
+            total += start_cost(chain.prior[j], chain.starts[j], own)
             for s in chain.sights[j]:
                 total += float((((s.value - predicted(s, own)) / (sizes.level[s.readings.sensor] * s.std)) ** 2).sum())
     total += prior_terms(problem.model, problem.prior, point.X)[2]
@@ -220,7 +221,9 @@ def _motion_terms(
     pull = np.zeros((K, ORDER, width))
     for j in range(n):
         own = coefficients[: chain.knots.size, j]
-        information, slope = prior_terms_of_motion(chain.knots, chain.starts[j], sizes.jerk[j] * lively[:, j], own)
+        information, slope = prior_terms_of_motion(
+            chain.prior[j], chain.starts[j], sizes.intensity[j] * lively[:, j], own
+        )
         for s in chain.sights[j]:
             more, steeper, _ = reading_terms(chain.knots, s, sizes.level[s.readings.sensor], own)
             information, slope = information + more, slope + steeper

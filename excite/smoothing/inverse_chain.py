@@ -6,7 +6,8 @@ averaged to a few slots, in which the model itself is averaged alike.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
@@ -17,8 +18,8 @@ from excite.model import Model
 from excite.model.machine import Sensor
 from excite.smoothing.block_tridiagonal import Windows, windows
 from excite.smoothing.linearisation import BatchedFunction
-from excite.smoothing.motion_readings import Sight, StartPrior, look, read_motion, start_prior
-from excite.smoothing.splines import ORDER, Knots, motion_basis, place
+from excite.smoothing.motion_readings import Readings, Sight, StartPrior, look, start_prior
+from excite.smoothing.splines import ORDER, WHITE, Knots, motion_basis, place, sampled_basis
 
 SLOTS = 4  # averages of torque in an interval of the knots; the noise between them tells the rows' noise
 CHUNK = 4000  # rows of torque that are linearised at once, for the memory's sake
@@ -28,6 +29,7 @@ CHUNK = 4000  # rows of torque that are linearised at once, for the memory's sak
 class Chain:
     """A log on its knots.
 
+    prior (n,): the knots by joint, with the derivative that is white.
     sights, starts: by joint. t (N,): times of the rows; interval (N,), basis (N, 3, 6). torque (N, n) [N m]; used (N,
     n): 1 for rows in which a channel was read. beside: further arguments (N, k) of the model, for its effects.
     slot (S,): place interval * slots + number of each slot that has rows; first (S,): its first row.
@@ -35,6 +37,7 @@ class Chain:
     """
 
     knots: Knots
+    prior: tuple[Knots, ...]
     sights: tuple[tuple[Sight, ...], ...]
     starts: tuple[StartPrior, ...]
     t: np.ndarray
@@ -137,9 +140,15 @@ class TorqueModel:
         return self.torque(motion.reshape(len(motion), -1), *chain.beside, X)[0][:, :, 0]
 
 
-def build_chain(model: Model, log: Log, knots: Knots, beside: tuple[np.ndarray, ...] = ()) -> Chain:
-    """Put a log on knots."""
-    readings = read_motion(model, log)
+def build_chain(
+    model: Model,
+    log: Log,
+    readings: Sequence[Sequence[Readings]],
+    knots: Knots,
+    white: Sequence[int],
+    beside: tuple[np.ndarray, ...] = (),
+) -> Chain:
+    """Put a log and its readings, by joint, on knots; white (n,): order of the derivative that is white noise."""
     sensors = torque_sensors(model)
     torque = np.column_stack([log.values[s.name] for s in sensors])
     used = np.column_stack([log.read_in(s.name) for s in sensors]).astype(float)
@@ -151,14 +160,16 @@ def build_chain(model: Model, log: Log, knots: Knots, beside: tuple[np.ndarray, 
     number = order * slots // most
     slot = interval * slots + number
     first = np.flatnonzero(np.diff(slot, prepend=-1))
-    duration = knots.step * knots.count
+    prior = tuple(replace(knots, white=w) for w in white)
+    curved = min(white) > min(WHITE)  # an acceleration whose slope is white noise has no curvature
     return Chain(
         knots,
+        prior,
         tuple(look(knots, own) for own in readings),
-        tuple(start_prior(own, duration) for own in readings),
+        tuple(start_prior(own, k) for own, k in zip(readings, prior, strict=True)),
         log.t,
         interval,
-        motion_basis(knots, share),
+        sampled_basis(knots, share, float(log.t[1] - log.t[0])) if curved else motion_basis(knots, share),
         torque,
         used,
         beside,

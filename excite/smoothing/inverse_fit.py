@@ -25,7 +25,14 @@ from excite.smoothing.inverse import (
 from excite.smoothing.inverse_chain import TorqueModel, build_chain, torque_sensors
 from excite.smoothing.inverse_sizes import correlation_factor, update_sizes
 from excite.smoothing.log_fit import HELD_STD, NotConvergedError, held_in_turn, prior_information, prior_terms
-from excite.smoothing.motion_readings import JointMotion, Readings, choose_knots, read_motion, speed_std
+from excite.smoothing.motion_readings import (
+    JointMotion,
+    Readings,
+    choose_knots,
+    least_intensity,
+    read_motion,
+    speed_std,
+)
 
 LEAST_NOISE_SHARE = 1e-3  # of the torque's root mean square; no sensor is better
 EXACT_PASSES = 15  # for the model alone, before discrepancies are tried; fewer if it settles; chosen
@@ -158,10 +165,12 @@ def first_state(model: Model, logs: Sequence[Log], settings: InverseSettings, be
     knots, motions = choose_knots(logs, readings)
     model = with_visible_friction(model, readings, motions)
     chains = tuple(
-        build_chain(model, log, k, beside[n] if beside else ())
-        for n, (log, k) in enumerate(zip(logs, knots, strict=True))
+        build_chain(model, log, own, k, [m.white for m in motions], beside[n] if beside else ())
+        for n, (log, own, k) in enumerate(zip(logs, readings, knots, strict=True))
     )
-    coefficients = tuple(np.column_stack([m.coefficients[n] for m in motions]) for n in range(len(logs)))
+    n, level = len(motions), {name: x for m in motions for name, x in m.level.items()}
+    least = [least_intensity([c.prior[j] for c in chains], [c.sights[j] for c in chains], level) for j in range(n)]
+    coefficients = tuple(np.column_stack([m.coefficients[k] for m in motions]) for k in range(len(logs)))
     sample = min(float(log.t[1] - log.t[0]) for log in logs)
     problem = Problem(
         TorqueModel(model),
@@ -169,11 +178,10 @@ def first_state(model: Model, logs: Sequence[Log], settings: InverseSettings, be
         prior_information(model, np.zeros(len(model.nominal), bool), model.nominal),
         max(settings.alignment, 1e-6) * sample,
         least_noise(model, logs),
+        np.array(least),
     )
-    n = problem.channels
-    level = {name: x for m in motions for name, x in m.level.items()}
     sizes = NoiseSizes(
-        np.array([m.jerk for m in motions]),
+        np.array([m.intensity for m in motions]),
         100 * problem.least_noise,
         np.full(n, np.inf),
         level,
@@ -501,7 +509,7 @@ def propose(state: State, reduced: Reduced, damping: float) -> tuple[Point, np.n
 
 
 def new_sizes(state: State, reduced: Reduced, first: bool) -> tuple[NoiseSizes, np.ndarray]:
-    """Return the sizes of noise and jerk after a step, and the slope of the motions' log determinant."""
+    """Return the sizes of noise and motion after a step, and the slope of the motions' log determinant."""
     p = len(state.point.X) + state.problem.channels
     information = reduced.information[:p, :p]
     prior, _ = _priors(state, p)
@@ -516,11 +524,11 @@ def _change(old: np.ndarray, new: np.ndarray) -> float:
 
 
 def _sizes_change(old: NoiseSizes, new: NoiseSizes) -> float:
-    """Largest relative change of noise and jerk; that of jerk counts little."""
+    """Largest relative change of noise and motion; that of the motion counts little."""
     noise = float(np.abs(np.log(new.noise / old.noise)).max())
-    jerk = float(np.abs(np.log(new.jerk / old.jerk)).max()) / 4
+    intensity = float(np.abs(np.log(new.intensity / old.intensity)).max()) / 4
     level = max((abs(np.log(new.level[n] / old.level[n])) for n in new.level), default=0.0)
-    return max(noise, jerk, level, float((old.tails != new.tails).any()))
+    return max(noise, intensity, level, float((old.tails != new.tails).any()))
 
 
 def conclude(

@@ -1,4 +1,4 @@
-"""Sizes of noise and jerk from the moments of what is left, and how far residuals are from white."""
+"""Sizes of noise and motion from the moments of what is left, and how far residuals are from white."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from excite.smoothing.inverse import (
 )
 from excite.smoothing.inverse_chain import Chain
 from excite.smoothing.motion_readings import predicted, reading_freedom
-from excite.smoothing.splines import ORDER, jerk_penalty, squared_jerk
+from excite.smoothing.splines import ORDER, penalty, roughness
 from excite.smoothing.tails import heaviness
 
 CORRELATED = 0.25  # mean correlation over five slots from which residuals are not white; smoothed noise has up to 0.2
 BLOCK_COUNTS = (20, 60)  # blocks of a log whose scores are summed: what lasts a twentieth of it counts in full
-JERK_TAILS = 2.0  # degrees of freedom of Student's t of the jerk: reversals and steps are rare and large
+MOTION_TAILS = 2.0  # degrees of freedom of Student's t of the white derivative: reversals and steps are rare and large
 
 
 @dataclass
@@ -82,10 +82,11 @@ def update_sizes(
         _add_slots(found, problem, chain, design, basis, sizes, point, m, covariance, first)
     left = np.maximum(found.number - found.spent - freedom / n, 0.05 * found.number)
     noise = np.maximum(np.sqrt(found.square / np.maximum(left, 1e-300)), problem.least_noise)
-    jerk = sizes.jerk * np.clip(found.roughness / np.maximum(found.rough_free, 1e-3) / sizes.jerk, 0.1, 10.0)
+    change = np.clip(found.roughness / np.maximum(found.rough_free, 1e-3) / sizes.intensity, 0.1, 10.0)
+    intensity = np.maximum(sizes.intensity * change, problem.least_intensity)
     tails = sizes.tails if first else np.array([heaviness(np.concatenate(own))[0] for own in found.standard])
     lively = tuple(
-        np.column_stack([(JERK_TAILS + own[m]) / (JERK_TAILS + 1) for own in found.expected])
+        np.column_stack([(MOTION_TAILS + own[m]) / (MOTION_TAILS + 1) for own in found.expected])
         for m in range(len(problem.chains))
     )
     level = dict(names)
@@ -93,26 +94,25 @@ def update_sizes(
         name, old = s.readings.sensor, names[s.readings.sensor]
         value = np.sqrt(found.level_square[name] / max(found.level_free[name], 1e-3 * len(s.readings.t)))
         level[name] = float(max(old * np.clip(value / old, 0.5, 2.0), s.readings.least / float(s.readings.std[0])))
-    return NoiseSizes(jerk, noise, tails, level, lively), found.pull * problem.model.scale
+    return NoiseSizes(intensity, noise, tails, level, lively), found.pull * problem.model.scale
 
 
 def _add_motion(
     found: _Moments, problem: Problem, chain: Chain, sizes: NoiseSizes, coefficients: np.ndarray, covariance: np.ndarray
 ) -> None:
-    """Add the squared jerk and the misfits of encoders, with what their estimation spends."""
+    """Add the roughness and the misfits of encoders, with what their estimation spends."""
     n, width = problem.channels, coefficients.shape[1]
     grid = covariance.reshape(chain.knots.count, ORDER, width, ORDER, width)
-    penalty = jerk_penalty(chain.knots)
     log = len(found.expected[0])
     for j in range(n):
-        own = coefficients[: chain.knots.size, j]
+        own, knots = coefficients[: chain.knots.size, j], chain.prior[j]
         joint = np.ascontiguousarray(grid[:, :, j, :, j])
-        square = squared_jerk(chain.knots, chain.near(own[:, None])[:, :, 0])[0]
-        hidden = np.einsum("kij,ij->k", joint, penalty)
+        square = roughness(knots, chain.near(own[:, None])[:, :, 0])[0]
+        hidden = np.einsum("kij,ij->k", joint, penalty(knots))
         lively = sizes.lively[log][:, j]
         found.roughness[j] += float((square / lively).sum())
-        found.rough_free[j] += chain.knots.count + 2 - float((hidden / lively).sum()) / sizes.jerk[j]
-        found.expected[j].append((square + hidden) / sizes.jerk[j])
+        found.rough_free[j] += knots.size - knots.white - float((hidden / lively).sum()) / sizes.intensity[j]
+        found.expected[j].append((square + hidden) / sizes.intensity[j])
         for s in chain.sights[j]:
             name = s.readings.sensor
             found.level_square[name] += float((((s.value - predicted(s, own)) / s.std) ** 2).sum())

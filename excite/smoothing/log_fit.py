@@ -175,7 +175,8 @@ class LogProblem:
     """Logs as a least-squares problem (`solver.Problem`).
 
     prior (n_base,): information about the machine file's values, scaled. held (n_base,): parameters that stay there.
-    pull: log determinant of the innovations, which belongs to twice the negative log-likelihood.
+    pull: log determinant of the innovations, which belongs to twice the negative log-likelihood. Its curvature,
+    pull_curvature (n_base,), shortens steps and is no information, as unknown forces change the determinant alike.
     """
 
     space: StateSpace
@@ -190,6 +191,7 @@ class LogProblem:
     linear: tuple[LinearisedLog, ...] = ()
     weights: list[np.ndarray] = field(default_factory=list)
     linearised_coefficients: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    pull_curvature: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @cached_property
     def least_pivots(self) -> np.ndarray:
@@ -246,6 +248,15 @@ class LogProblem:
             cost += float(deviation @ deviation)
         return information, slope, cost
 
+    def with_logs(self, linear: Sequence[LinearisedLog]) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return information, slope and cost of the priors and of linearised logs, scaled."""
+        information, slope, cost = self.beside_logs()
+        for log, own in zip(linear, self.indices, strict=True):
+            information[np.ix_(own, own)] += log.Z[1:, 1:]
+            slope[own] += log.Z[1:, 0]
+            cost += float(log.Z[0, 0])
+        return information, slope, cost
+
     def quadratic(self) -> Quadratic | None:
         """Linearise every log and integrate out its states; return None if a chain is singular."""
         X, self.linear = self.point.X, ()  # both at once take twice the memory
@@ -254,17 +265,13 @@ class LogProblem:
                 forward.linearise(self.space, e, start.state[0], X)
                 for e, start in zip(self.evaluations, self.starts, strict=True)
             )
+            information, slope, cost = self.with_logs(linear)
         except np.linalg.LinAlgError:  # the chain is numerically singular this far off
             return None
-        information, slope, cost = self.beside_logs()
-        for log, own in zip(linear, self.indices, strict=True):
-            information[np.ix_(own, own)] += log.Z[1:, 1:]
-            slope[own] += log.Z[1:, 0]
-            cost += float(log.Z[0, 0])
-        lost = any(log.Z[0, 0] < 0 for log in linear)  # a sum of squares: rounding has taken over
-        if lost or not (np.isfinite(information).all() and (np.diag(information) > 0).all()):
+        if not (np.isfinite(information).all() and (np.diag(information) > 0).all()):
             return None
         self.linear, self.linearised_coefficients = linear, self.unknown.coefficients(self.point.trajectories)
+        self.pull_curvature = np.zeros(len(X)) if self.pull is None else self.pull.terms(X, self.space.model.scale)[0]
         n_p = len(self.prior)
         parameter = np.arange(len(slope)) < n_p
         free = parameter.copy()
@@ -297,7 +304,7 @@ class LogProblem:
         """Set the weights of the defects from the multipliers of a step."""
         new = []
         for log, own in zip(self.linear, self.indices, strict=True):
-            multiplier = log.chain.states(step[own])[1][1:]
+            multiplier = log.states(step[own])[1][1:]
             if log.closing is not None:
                 multiplier = (log.closing.transpose(0, 2, 1) @ multiplier[:, :, None])[:, :, 0]
             multiplier = 2 * np.abs(multiplier)
@@ -405,7 +412,8 @@ def _as_fit(
     if solution.quadratic is None:
         information, right_side, covariance = np.zeros((n, n)), np.zeros(n), np.full((n, n), np.inf)
     else:
-        information, here = solution.quadratic.information, np.zeros(len(solution.quadratic.slope))
+        information, here = solution.quadratic.information.copy(), np.zeros(len(solution.quadratic.slope))
+        information[range(n), range(n)] -= problem.pull_curvature
         here[n : n + problem.unknown.count] = problem.linearised_coefficients
         right_side = information @ here - solution.quadratic.slope
         covariance = covariance_in_si(problem.space, solver.inverse(information))
@@ -439,6 +447,7 @@ def find_unidentifiable(problem: LogProblem, quadratic: Quadratic, held: np.ndar
     X, information, model = problem.point.X, quadratic.information.copy(), problem.space.model
     judged = np.flatnonzero(problem.held & ~held)
     information[judged, judged] += (prior_information(model, held, X) - problem.prior)[judged]
+    information[range(len(X)), range(len(X))] -= problem.pull_curvature
     size = np.maximum(np.abs(X) / model.scale, 1.0)
     return held_in_turn(solver.inverse(information)[: len(X), : len(X)], size, held)
 
@@ -490,11 +499,7 @@ def newton_step(
         space, measurements, (), prior, np.zeros(len(X), bool), no_unknown_forces(space, len(measurements))
     )
     problem.point = Point(X, tuple(trajectories))
-    information, slope, cost = problem.beside_logs()
-    for log, own in zip(linear, problem.indices, strict=True):
-        information[np.ix_(own, own)] += log.Z[1:, 1:]
-        slope[own] += log.Z[1:, 0]
-        cost += float(log.Z[0, 0])
+    information, slope, cost = problem.with_logs(linear)
     if fixed is not None:
         information[range(len(X)), range(len(X))] += fixed * HELD_STD**-2
     try:

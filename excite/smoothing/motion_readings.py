@@ -1,4 +1,4 @@
-"""Motions from the readings of encoders and speed sensors alone: integrated white jerk, by marginal likelihood.
+"""Motions from the readings of encoders and speed sensors alone, by marginal likelihood; a derivative is white noise.
 
 Readings stand at their own times. An encoder is read right after its count has changed, as the moment of an edge gives
 the angle; while a count stays, all its readings together say no more than one.
@@ -8,10 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
-import scipy
 
 from excite.logs import Log, white_noise
 from excite.model import Model
@@ -30,17 +28,19 @@ from excite.smoothing.block_tridiagonal import (
 from excite.smoothing.measurements import EDGE_STD, MAX_COUNT_ERROR
 from excite.smoothing.splines import (
     ORDER,
-    THIRD_GRAM,
+    WHITE,
     Knots,
     even_knots,
-    jerk_penalty,
     motion_basis,
+    penalty,
     place,
-    squared_jerk,
+    roughness,
+    start_basis,
+    unit_log_determinant,
 )
 
 START_RANGES = 10.0  # standard deviation of the first state, in ranges of the motion; wide enough to tell nothing
-MAX_UPDATES = 40  # of the sizes of jerk and noise
+MAX_UPDATES = 40  # of the sizes of motion and noise
 SETTLED = 0.02  # relative change of a size that ends them
 LEAST_GAIN = 1.0  # of log-likelihood by halving the step of the knots, that is worth it
 COARSEST_STEP = 0.1  # [s] from which knots are refined; machines move within less
@@ -180,16 +180,16 @@ def reading_freedom(sight: Sight, level: float, covariance: np.ndarray) -> float
 
 @dataclass(frozen=True)
 class StartPrior:
-    """Prior of q, q', q'' (3,) at the first knot: mean and information."""
+    """Prior of q, q', q'' and on (m,), up to the white derivative, at the first knot: mean and information."""
 
     mean: np.ndarray
     information: np.ndarray
 
 
-def start_prior(readings: Sequence[Readings], duration: float) -> StartPrior:
+def start_prior(readings: Sequence[Readings], knots: Knots) -> StartPrior:
     """Return a prior of the first state that tells nothing, but that the angle is zero if only speeds are read."""
     angles = [r for r in readings if r.derivative == 0]
-    mean = np.zeros(3)
+    mean, duration = np.zeros(knots.white), knots.step * knots.count
     if angles:
         span = max(float(np.ptp(r.value)) for r in angles)
         mean[0] = angles[0].value[0]
@@ -198,44 +198,31 @@ def start_prior(readings: Sequence[Readings], duration: float) -> StartPrior:
     size = START_RANGES * max(span, 1e-6)
     least = min(float(r.std.min()) for r in readings)
     shortest = max(duration / 100, 1e-3)
-    std = np.array([size if angles else least * 1e-2, size / shortest, size / shortest**2])
+    std = size / shortest ** np.arange(float(knots.white))
+    std[0] = size if angles else least * 1e-2
     return StartPrior(mean, std**-2)
 
 
-@lru_cache(maxsize=64)
-def unit_log_determinant(count: int) -> float:
-    """Natural logarithm of the determinant of the jerk penalty on unit knots, up to a constant.
-
-    The third derivative is a quadratic spline of the third differences of the coefficients, whose Gram matrix is banded
-    and well conditioned.
-    """
-    banded = np.zeros((3, count + 2))
-    for i in range(3):
-        for j in range(i + 1):
-            banded[i - j, j : j + count] += THIRD_GRAM[i, j]
-    return 2 * float(np.log(scipy.linalg.cholesky_banded(banded, lower=True)[0]).sum())
-
-
-def prior_log_determinant(knots: Knots, start: StartPrior, jerk: float) -> float:
+def prior_log_determinant(knots: Knots, start: StartPrior, intensity: float) -> float:
     """Natural logarithm of the determinant of the prior's information about the coefficients of one coordinate."""
-    free = knots.count + 2
+    m, free = knots.white, knots.count + ORDER - 1 - knots.white
     return float(
         np.log(start.information).sum()
-        - free * np.log(jerk)
-        - (5 * free + 6) * np.log(knots.step)
-        + unit_log_determinant(knots.count)
+        - free * np.log(intensity)
+        - ((2 * m - 1) * free + m * (m - 1)) * np.log(knots.step)
+        + unit_log_determinant(knots.count, m)
     )
 
 
 def prior_terms_of_motion(
-    knots: Knots, start: StartPrior, jerk: np.ndarray | float, coefficients: np.ndarray
+    knots: Knots, start: StartPrior, intensity: np.ndarray | float, coefficients: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return information (K, 6, 6) and slope (K, 6) of a motion's prior; jerk: intensity, or that of each interval."""
+    """Return information (K, 6, 6) and slope (K, 6) of a motion's prior; intensity: one, or that of each interval."""
     near = coefficients[np.arange(knots.count)[:, None] + np.arange(ORDER)]
-    stiffness = np.broadcast_to(1 / np.asarray(jerk), (knots.count,))
-    information = stiffness[:, None, None] * jerk_penalty(knots)
-    slope = -stiffness[:, None] * squared_jerk(knots, near)[1]
-    first = motion_basis(knots, np.zeros(1))[0]
+    stiffness = np.broadcast_to(1 / np.asarray(intensity), (knots.count,))
+    information = stiffness[:, None, None] * penalty(knots)
+    slope = -stiffness[:, None] * roughness(knots, near)[1]
+    first = start_basis(knots)
     weighted = first.T * start.information
     information[0] += weighted @ first
     slope[0] += weighted @ (start.mean - first @ near[0])
@@ -244,19 +231,20 @@ def prior_terms_of_motion(
 
 def start_cost(knots: Knots, start: StartPrior, coefficients: np.ndarray) -> float:
     """Return twice the negative logarithm of the density of the first state."""
-    off = motion_basis(knots, np.zeros(1))[0] @ coefficients[:ORDER] - start.mean
+    off = start_basis(knots) @ coefficients[:ORDER] - start.mean
     return float(start.information @ off**2)
 
 
 @dataclass(frozen=True)
 class JointMotion:
-    """Motion of one joint in all logs: coefficients (K + 5,) of each, jerk intensity, level of each sensor's noise.
+    """Motion of one joint in all logs: coefficients (K + 5,) of each, intensity, level of each sensor's noise.
 
     log_likelihood: marginal, of all readings of the joint.
     """
 
     coefficients: tuple[np.ndarray, ...]
-    jerk: float
+    white: int
+    intensity: float
     level: dict[str, float]
     log_likelihood: float
 
@@ -264,8 +252,9 @@ class JointMotion:
 def speed_std(readings: Sequence[Sequence[Readings]], motion: JointMotion) -> float | None:
     """Return the standard deviation of a joint's smoothed speed [rad/s, m/s]; None without readings of its position.
 
-    readings: of the joint in each log. With positions of information density 1 / R [1/SI^2 s] and white jerk of
-    intensity r, the error of the speed has the spectrum w^2 R / (1 + w^6 R / r), whose integral is sqrt(r R) / 6.
+    readings: of the joint in each log. With positions of information density 1 / R [1/SI^2 s] and a white derivative
+    of order m and intensity r, the error of the speed has the spectrum w^2 R / (1 + w^2m R / r), whose integral is
+    R (r / R)^(3 / 2m) / (2 m sin(3 pi / 2m)); for m = 3 that is sqrt(r R) / 6.
     """
     information, time = 0.0, 0.0
     for own in readings:
@@ -274,41 +263,41 @@ def speed_std(readings: Sequence[Sequence[Readings]], motion: JointMotion) -> fl
         time += max((float(np.ptp(r.t)) for r in positions), default=0.0)
     if not (information > 0 and time > 0):
         return None
-    return float(np.sqrt(np.sqrt(motion.jerk * time / information) / 6))
+    R, share = time / information, 1.5 / motion.white
+    return float(np.sqrt(R * (motion.intensity / R) ** share / (2 * motion.white * np.sin(np.pi * share))))
 
 
 def smooth_joint(
     knots: Sequence[Knots], readings: Sequence[Sequence[Readings]], before: JointMotion | None = None
 ) -> JointMotion | None:
-    """Smooth the readings of one joint in all logs, with the sizes of jerk and noise that are most likely.
+    """Smooth the readings of one joint in all logs, with the sizes that are most likely.
 
     before: a motion whose sizes are good ones to begin with. Returns None if the readings leave the motion open.
     """
     sights = [look(k, r) for k, r in zip(knots, readings, strict=True)]
-    starts = [start_prior(r, k.step * k.count) for k, r in zip(knots, readings, strict=True)]
+    starts = [start_prior(r, k) for k, r in zip(knots, readings, strict=True)]
     level = dict(before.level) if before else {s.readings.sensor: 1.0 for own in sights for s in own}
-    jerk = before.jerk if before else _first_jerk(readings)
+    white = knots[0].white
+    intensity = before.intensity if before and before.white == white else _first_intensity(readings, white)
     coefficients = [np.zeros(k.size) for k in knots]
     for pass_count in range(MAX_UPDATES):
-        roughness, free, value = 0.0, 0.0, 0.0
+        rough, free, value = 0.0, 0.0, 0.0
         square = dict.fromkeys(level, 0.0)
         freedom = dict.fromkeys(level, 0.0)
         number = dict.fromkeys(level, 0)
         for n, (k, start) in enumerate(zip(knots, starts, strict=True)):
-            solved = _smooth_chain(k, sights[n], start, jerk, level)
+            solved = _smooth_chain(k, sights[n], start, intensity, level)
             if solved is None:
                 return None
             coefficients[n], factor = solved
             covariance = gather(windows(k.count, ORDER, 1), inverse_blocks(factor))
-            own_roughness = float(
-                squared_jerk(k, coefficients[n][np.arange(k.count)[:, None] + np.arange(ORDER)])[0].sum()
-            )
-            roughness += own_roughness
-            free += k.count + 2 - float((covariance * jerk_penalty(k)).sum()) / jerk
+            own_rough = float(roughness(k, coefficients[n][np.arange(k.count)[:, None] + np.arange(ORDER)])[0].sum())
+            rough += own_rough
+            free += k.size - white - float((covariance * penalty(k)).sum()) / intensity
             value += (
-                prior_log_determinant(k, start, jerk)
+                prior_log_determinant(k, start, intensity)
                 - factor.log_determinant
-                - own_roughness / jerk
+                - own_rough / intensity
                 - start_cost(k, start, coefficients[n])
             )
             for s in sights[n]:
@@ -319,9 +308,9 @@ def smooth_joint(
                 freedom[name] += reading_freedom(s, level[name], covariance)
                 value -= own / level[name] ** 2 + 2 * float(np.log(level[name] * s.std).sum())
             sights[n] = tuple(s.along(coefficients[n]) for s in sights[n])
-        changed = np.clip(roughness / max(free, 1e-3 * len(knots)) / jerk, 0.05, 20.0)
+        changed = np.clip(rough / max(free, 1e-3 * len(knots)) / intensity, 0.05, 20.0)
         largest = abs(np.log(changed))
-        jerk = max(jerk * changed, _least_jerk(knots, sights, level))
+        intensity = max(intensity * changed, least_intensity(knots, sights, level))
         for own_sights in sights[:1]:
             for s in own_sights:
                 name = s.readings.sensor
@@ -334,27 +323,27 @@ def smooth_joint(
                 level[name] = float(new)
         if largest < SETTLED and pass_count:
             break
-    return JointMotion(tuple(coefficients), float(jerk), level, value / 2)
+    return JointMotion(tuple(coefficients), white, float(intensity), level, value / 2)
 
 
-def _least_jerk(knots: Sequence[Knots], sights: Sequence[Sequence[Sight]], level: dict[str, float]) -> float:
-    """Return a jerk intensity so small that a larger prior would only spoil the condition of the system."""
+def least_intensity(knots: Sequence[Knots], sights: Sequence[Sequence[Sight]], level: dict[str, float]) -> float:
+    """Return an intensity so small that a larger prior would only spoil the condition of the system."""
     noise = min(level[s.readings.sensor] * float(s.std.min()) for own in sights for s in own)
-    return noise**2 / (CONDITION * max(k.step for k in knots) ** 5)
+    return noise**2 / (CONDITION * max(k.step for k in knots) ** (2 * knots[0].white - 1))
 
 
-def _first_jerk(readings: Sequence[Sequence[Readings]]) -> float:
-    """Return a jerk intensity to begin with, from the range of the angles and a usual time of a second."""
+def _first_intensity(readings: Sequence[Sequence[Readings]], white: int) -> float:
+    """Return an intensity to begin with, from the range of the angles and a usual time of a second."""
     spans = [float(np.ptp(r.value)) for own in readings for r in own]
-    return max(max(spans), 1e-6) ** 2 * 1e3
+    return max(max(spans), 1e-6) ** 2 * 10.0**white
 
 
 def _smooth_chain(
-    knots: Knots, sights: Sequence[Sight], start: StartPrior, jerk: float, level: dict[str, float]
+    knots: Knots, sights: Sequence[Sight], start: StartPrior, intensity: float, level: dict[str, float]
 ) -> tuple[np.ndarray, Factor] | None:
     """Return the most likely coefficients (K + 5,) and the factor of their information, None if it is singular."""
     zero = np.zeros(knots.size)
-    information, slope = prior_terms_of_motion(knots, start, jerk, zero)
+    information, slope = prior_terms_of_motion(knots, start, intensity, zero)
     for s in sights:
         own, pull, _ = reading_terms(knots, s, level[s.readings.sensor], zero)
         information += own
@@ -372,36 +361,58 @@ def _smooth_chain(
 def choose_knots(
     logs: Sequence[Log], readings: Sequence[Sequence[Sequence[Readings]]]
 ) -> tuple[list[Knots], list[JointMotion]]:
-    """Choose the widest knots that lose no likelihood of the readings; return them and the motion of each joint.
+    """Choose the widest knots that lose no likelihood of the readings, and for each joint its most likely motion.
 
-    readings: by log and joint. All logs have knots of one step. Knots are halved down to a row while the
-    marginal likelihood of the readings gains by it.
+    readings: by log and joint. Returns knots, and the motion of each joint with the derivative that is white. All logs
+    have knots of one step, which is halved down to a row while the marginal likelihood of the readings gains by it.
     """
     sample = min(float(log.t[1] - log.t[0]) for log in logs)
     halvings = 1 + max(0, int(np.floor(np.log2(min(COARSEST_STEP / sample, READINGS_PER_STEP)))))
     best: tuple[list[Knots], list[JointMotion]] | None = None
     for k in range(halvings, 0, -1):
         knots = [even_knots(float(log.t[0]), float(log.t[-1]), sample * 2.0 ** (k - 1)) for log in logs]
-        motions = []
-        for j in range(len(readings[0])):
-            found = smooth_joint(knots, [own[j] for own in readings], best[1][j] if best else None)
-            if found is None:
-                break
-            motions.append(found)
-        if len(motions) < len(readings[0]):
+        motions = _smooth_joints(knots, readings, best[1] if best else None)
+        if motions is None or (best is not None and _likelihood(motions) - _likelihood(best[1]) < LEAST_GAIN):
             break
-        if best is not None:
-            gain = sum(m.log_likelihood for m in motions) - sum(m.log_likelihood for m in best[1])
-            if gain < LEAST_GAIN:
-                break
         best = knots, motions
     assert best is not None
+    best = best[0], [_whiter(best[0], [own[j] for own in readings], m) for j, m in enumerate(best[1])]
     unknowns = sum(k.count for k in best[0]) * len(readings[0])
     while best[0][0].step > FINEST_SHARE * sample and unknowns <= MANY_UNKNOWNS:  # torques show more than encoders do
         unknowns *= 2
-        knots = [even_knots(k.start, k.start + k.step * k.count, k.step / 2) for k in best[0]]
-        finer = [smooth_joint(knots, [own[j] for own in readings], best[1][j]) for j in range(len(readings[0]))]
-        if any(m is None for m in finer):
+        knots = [replace(k, step=k.step / 2, count=2 * k.count) for k in best[0]]
+        motions = _smooth_joints(knots, readings, best[1])
+        if motions is None:
             break
-        best = knots, [m for m in finer if m is not None]
+        best = knots, motions
     return best
+
+
+def _whiter(knots: Sequence[Knots], readings: Sequence[Sequence[Readings]], motion: JointMotion) -> JointMotion:
+    """Return the motion of one joint with the derivative that is most likely white."""
+    for white in WHITE[1:]:
+        found = smooth_joint([replace(k, white=white) for k in knots], readings, motion)
+        if found is None or found.log_likelihood - motion.log_likelihood < LEAST_GAIN:
+            break
+        motion = found
+    return motion
+
+
+def _smooth_joints(
+    knots: Sequence[Knots],
+    readings: Sequence[Sequence[Sequence[Readings]]],
+    before: Sequence[JointMotion] | None,
+) -> list[JointMotion] | None:
+    found: list[JointMotion] = []
+    for j in range(len(readings[0])):
+        start = before[j] if before else None
+        own = [replace(k, white=start.white) for k in knots] if start else knots
+        motion = smooth_joint(own, [log[j] for log in readings], start)
+        if motion is None:
+            return None
+        found.append(motion)
+    return found
+
+
+def _likelihood(motions: Sequence[JointMotion]) -> float:
+    return sum(m.log_likelihood for m in motions)

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from excite.smoothing.innovations import expected_squares, whiten
 from excite.smoothing.linearisation import StateSpace
@@ -66,7 +67,6 @@ def fit_unknown_forces(
     """
     model, n_u = space.model, len(space.model.inputs)
     white = np.array([FIRST_FORCE_STD * (kind in FORCES) for _, kind in space.forces])
-    least = _least_force_std(space, measurements)
     X, trajectories = (model.nominal, tuple(starts)) if first is None else (first[0], tuple(first[1]))
     size, inflation, logs, pull = None, np.ones(n_u), tuple(measurements), None
     fit: Fit | None = None
@@ -77,8 +77,7 @@ def fit_unknown_forces(
         else:
             unknown = replace(unknown, size=size)
         latest = fit_logs(space, logs, trajectories, X, starts, held, settings=settings, unknown=unknown, pull=pull)
-        unmoved = any(t.force_error is None for t in latest.trajectories)
-        lost = unmoved or not latest.linear or not latest.cost > 0
+        lost = not (latest.linear and latest.cost > 0) or any(t.force_error is None for t in latest.trajectories)
         fit = latest if fit is None or not lost else fit
         if lost:
             break
@@ -88,56 +87,86 @@ def fit_unknown_forces(
         size = np.maximum(found, SLOWEST_SHRINKING * unknown.size)
         ratio = white_noise_ratios(fit)
         inflation = np.maximum(inflation * ratio[:n_u], 1.0)
-        logs = tuple(
-            replace(data, noise=replace(data.noise, torque=data.noise.torque * np.sqrt(inflation)))
-            for data in measurements
-        )
-        forced = white > 0
+        louder = (replace(data.noise, torque=data.noise.torque * np.sqrt(inflation)) for data in measurements)
+        logs = tuple(replace(data, noise=noise) for data, noise in zip(measurements, louder, strict=True))
         white = white.copy()
-        white[forced] *= np.where(
-            ratio[n_u:] < 1, np.maximum(ratio[n_u:], 0.1), np.sqrt(np.minimum(ratio[n_u:], 100.0))
-        )
-        white[forced] = np.maximum(white, least)[forced]
-        # Memory: what recovers states is no longer needed.
-        fit = replace(fit, linear=tuple(replace(log, chain=log.chain.without_levels) for log in fit.linear))
+        white[white > 0] *= np.clip(np.minimum(ratio[n_u:], np.sqrt(ratio[n_u:])), 0.1, 10.0)
     assert fit is not None
     spread = clustered_inflation(fit, float(model.machine.sampling_hz)) if fit.linear else np.ones(len(fit.X))
     return FitBeside(replace(fit, covariance=fit.covariance * np.outer(spread, spread)), logs)
 
 
-def _least_force_std(space: StateSpace, measurements: Sequence[Measurements]) -> np.ndarray:
-    """Return the least standard deviation (n_forces,) of white forces: that of a driven contact's torque noise.
+AVERAGED_SCATTER = 1.5  # of the logarithm of a size about the level of all; chosen, wider than where sizes are sought
 
-    Smaller ones would hardly narrow any interval, and leave no room for what no shape follows.
+
+def average_over_sizes(space: StateSpace, fit: Fit) -> Fit:
+    """Return the fit with parameters and covariance averaged over what sizes may be, not for the most likely ones.
+
+    Where logs tell little of a size, a most likely one is too small as often as too large, and values that depend on
+    it are surer than they should be. Each group's size is averaged over its posterior about the fit's quadratic form,
+    the others fixed (law of total variance); what that adds is summed over the groups, and nothing is taken away.
+    Constant errors cannot be told from the parameters; their variance is the mean square before any log. Parameters
+    move as far as they may; the trajectories stay.
     """
-    noise = np.max([data.noise.torque for data in measurements], axis=0)
-    contacts = {b.index: b.contact for b in space.model.machine.contacts if b.contact is not None}
-    drives = zip(space.model.machine.actuated, noise, strict=True)
-    force = min((x / float(b.contact.radius) for b, x in drives if b.contact is not None), default=0.0)
-    half_width = {k: float(c.width) / 2 for k, c in contacts.items() if c.width is not None}
-    return np.array([force * (half_width.get(k, 0.0) if kind == "turning" else 1.0) for k, kind in space.forces])
+    n, unknown, model = len(fit.X), fit.unknown, space.model
+    every = inverse(fit.information)
+    mean = every @ fit.right_side
+    level = np.log(unknown.size).mean()
+    square = scipy.special.softmax(-(((LEVELS - level) / AVERAGED_SCATTER) ** 2) / 2) @ np.exp(2 * LEVELS)
+    moved, more = np.zeros(n), np.zeros((n, n))
+    for group, size in zip(unknown.groups, unknown.size, strict=True):
+        own = n + group.every
+        precision = np.linalg.inv(every[np.ix_(own, own)])
+        by_own = every[:n, own] @ precision
+        told = _positive_part(precision - size**-2 * np.eye(len(own)))
+        weights, means, covariances = list[float](), list[np.ndarray](), list[np.ndarray]()
+        for log in LEVELS:
+            information = told + np.exp(-2 * log) * np.eye(len(own))
+            covariances.append(np.linalg.inv(information))
+            means.append(covariances[-1] @ precision @ mean[own])
+            gained = means[-1] @ information @ means[-1] - np.linalg.slogdet(information)[1]
+            weights.append(gained / 2 - len(own) * log - ((log - level) / AVERAGED_SCATTER) ** 2 / 2)
+        weight = scipy.special.softmax(weights)
+        average = weight @ np.array(means)
+        off = np.array(means) - average
+        covariance = np.einsum("k,kij->ij", weight, covariances) + (weight[:, None] * off).T @ off
+        moved += by_own @ (average - mean[own])
+        more += by_own @ _positive_part(covariance - every[np.ix_(own, own)]) @ by_own.T
+    spread = fit.std / np.sqrt(np.diag(every)[:n])
+    shares = (fit.X + share * model.scale * moved for share in (1.0, 0.5, 0.25))
+    allowed = (X for X in shares if (X[model.positive] > 0).all() and not (space.soil @ X > 0).any())
+    constant = np.diag(square * unknown.constant_errors**2)
+    return replace(fit, X=next(allowed, fit.X), covariance=(every[:n, :n] + more) * np.outer(spread, spread) + constant)
 
 
-CLUSTER_S = 2.0  # [s] of a log whose errors may belong together: a manoeuvre
+def _positive_part(A: np.ndarray) -> np.ndarray:
+    """Return a symmetric matrix (n, n) without its negative eigenvalues."""
+    values, vectors = np.linalg.eigh((A + A.T) / 2)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+CLUSTER_S = 2.0  # [s] of a log within which errors may be correlated: a manoeuvre
 
 
 def clustered_inflation(fit: Fit, rate: float) -> np.ndarray:
-    """Return factors (n_base,), at least 1, on standard deviations for errors that belong together within CLUSTER_S.
+    """Return factors (n_base,), at least 1, on standard deviations for errors that are correlated within CLUSTER_S.
 
-    What is still wrong is no white noise. The scores of a log's stretches show how much they do belong together
-    (sandwich of White, Econometrica 48 (1980) 817, over clusters).
+    A jackknife: the linearised fit is solved again without each stretch, as scores alone say too little where many
+    coefficients follow a stretch closely (Bell and McCaffrey, Survey Methodology 28 (2002) 169, without the factor for
+    few clusters). A tenth of what one stretch alone tells stays, or only the prior would.
     """
-    covariance, n = inverse(fit.information), len(fit.X)
-    meat = np.zeros_like(covariance)
+    covariance, size = inverse(fit.information), int(CLUSTER_S * rate)
+    square, n = np.zeros(len(fit.X)), len(fit.X)
     for log, own in zip(fit.linear, fit.indices, strict=True):
-        E = whiten(log).E
-        score = np.einsum("kmc,km->kc", E[:, :, 1:], E[:, :, 0]).astype(float)
-        starts = np.arange(0, len(score), int(CLUSTER_S * rate))
-        stretches = np.zeros((len(starts), len(covariance)))
-        stretches[:, own] = np.add.reduceat(score, starts, axis=0)
-        meat += stretches.T @ stretches
-    clustered = covariance @ meat @ covariance
-    return np.sqrt(np.maximum(np.diag(clustered)[:n] / np.diag(covariance)[:n], 1.0))
+        values, vectors = np.linalg.eigh(covariance[np.ix_(own, own)])
+        root, E = vectors * np.sqrt(np.maximum(values, 0.0)), whiten(log).E
+        for begin in range(0, len(E), size):
+            rows = E[begin : begin + size].reshape(-1, E.shape[2]).astype(float)
+            seen = rows[:, 1:] @ root
+            share, along = np.linalg.eigh(seen.T @ seen)  # that the stretch has of what is known in each direction
+            moved = along @ (along.T @ (seen.T @ rows[:, 0]) / (1 - np.minimum(share, 0.9)))
+            square += (root[:n] @ moved) ** 2
+    return np.sqrt(np.maximum(square / np.diag(covariance)[:n], 1.0))
 
 
 def lacks_forces(
@@ -223,9 +252,7 @@ def _integrate_out_parameters(fit: Fit) -> _Coefficients:
     cross = fit.information[np.ix_(outer, inner)]
     solved = np.linalg.solve(fit.information[np.ix_(outer, outer)], np.column_stack([cross, fit.right_side[outer]]))
     information = fit.information[np.ix_(inner, inner)] - np.diag(fit.unknown.precision) - cross.T @ solved[:, :-1]
-    values, vectors = np.linalg.eigh((information + information.T) / 2)
-    information = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return _Coefficients(information, fit.right_side[inner] - cross.T @ solved[:, -1], group)
+    return _Coefficients(_positive_part(information), fit.right_side[inner] - cross.T @ solved[:, -1], group)
 
 
 def white_noise_ratios(fit: Fit) -> np.ndarray:

@@ -1,32 +1,34 @@
-"""Smooth motions as quintic splines on even knots, with the prior of an integrated white jerk.
+"""Smooth motions as quintic splines on even knots, with the prior that one of their derivatives is white noise.
 
 A coordinate is q(t) = sum_k c_k B((t - start) / step - k + 5) with the cardinal B-spline B of degree five. The prior
-density of white jerk of intensity S (a power per hertz, [m2/s5]) is exp(-1/2 integral q'''^2 / S); its minimisers are
-quintic splines. Source: G. Wahba, "Spline Models for Observational Data", 1990, ch. 1.
+density of a white derivative of order m (3, the jerk, to 5) and intensity S (a power per hertz, [m2/s5] of jerk) is
+exp(-1/2 integral (d^m q / dt^m)^2 / S). Source: G. Wahba, "Spline Models for Observational Data", 1990, ch. 1.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 import scipy
 
-DEGREE = 5  # of the splines that minimise the integral of the squared jerk
+DEGREE = 5  # of the splines, which minimise the integral of the squared jerk
 ORDER = DEGREE + 1  # number of coefficients that act in one interval
-QUADRATIC = np.array([[0.5, 0.5, 0.0], [-1.0, 1.0, 0.0], [0.5, -1.0, 0.5]])  # pieces of the quadratic B-spline
-THIRD_GRAM = QUADRATIC.T @ scipy.linalg.hilbert(3) @ QUADRATIC  # integrals of products of its pieces
-THIRD_DIFFERENCE = np.array([[-1, 3, -3, 1, 0, 0], [0, -1, 3, -3, 1, 0], [0, 0, -1, 3, -3, 1]], float)
+WHITE = (3, 4, 5)  # orders of the derivatives that may be white; the acceleration is none
 
 
 @dataclass(frozen=True)
 class Knots:
-    """Even knots: `count` intervals of `step` [s] from `start` [s]; a spline has count + 5 coefficients."""
+    """Even knots: `count` intervals of `step` [s] from `start` [s]; a spline has count + 5 coefficients.
+
+    white: order of the derivative that the prior takes as white noise.
+    """
 
     start: float
     step: float
     count: int
+    white: int = WHITE[0]
 
     @property
     def size(self) -> int:
@@ -49,26 +51,78 @@ def place(knots: Knots, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def motion_basis(knots: Knots, share: np.ndarray) -> np.ndarray:
     """Return q, q' and q'' (N, 3, 6) per coefficient of an interval, at shares (N,) of it."""
-    found = np.empty((len(share), 3, ORDER))
-    for k in range(3):
+    return _derivatives(knots, share, 3)
+
+
+def sampled_basis(knots: Knots, share: np.ndarray, sample: float) -> np.ndarray:
+    """Return q, q' and q'' (N, 3, 6) at times where torques are sampled, every `sample` [s], and linear in between.
+
+    An acceleration that is linear between samples turns at each of them: the smooth one that moves a joint alike is
+    lower by its curvature times sample^2 / 12 there.
+    """
+    found = _derivatives(knots, share, DEGREE)
+    found[:, 2] -= sample**2 / 12 * found[:, 4]
+    return found[:, :3]
+
+
+def start_basis(knots: Knots) -> np.ndarray:
+    """Return the derivatives (white, 6) below the white one per coefficient of the first interval, at its start."""
+    return np.asarray(_derivatives(knots, np.zeros(1), knots.white)[0])
+
+
+def _derivatives(knots: Knots, share: np.ndarray, count: int) -> np.ndarray:
+    found = np.empty((len(share), count, ORDER))
+    for k in range(count):
         powers = share[:, None] ** np.arange(ORDER - k)
         found[:, k] = powers @ _polynomials(k) / knots.step**k
     return found
 
 
-def jerk_penalty(knots: Knots) -> np.ndarray:
-    """Return the integral of the squared jerk (6, 6) over one interval, as a quadratic form of its coefficients."""
-    return np.asarray(THIRD_DIFFERENCE.T @ THIRD_GRAM @ THIRD_DIFFERENCE / knots.step**5)
+def penalty(knots: Knots) -> np.ndarray:
+    """Return the integral of the squared white derivative (6, 6) over an interval, by its coefficients."""
+    D = _difference(knots.white)
+    return np.asarray(D.T @ _gram(knots.white) @ D / knots.step ** (2 * knots.white - 1))
 
 
-def squared_jerk(knots: Knots, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the integral of the squared jerk (K,) over each interval and half its slope (K, 6) by its coefficients.
+def roughness(knots: Knots, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the integral of the squared white derivative (K,) over each interval and half its slope (K, 6).
 
     near (K, 6): coefficients of each interval.
     """
-    third = np.diff(near, 3, axis=1)
-    pull = third @ THIRD_GRAM / knots.step**5
-    return (pull * third).sum(axis=1), pull @ THIRD_DIFFERENCE
+    differences = np.diff(near, knots.white, axis=1)
+    pull = differences @ _gram(knots.white) / knots.step ** (2 * knots.white - 1)
+    return (pull * differences).sum(axis=1), pull @ _difference(knots.white)
+
+
+@lru_cache(maxsize=64)
+def unit_log_determinant(count: int, white: int) -> float:
+    """Return the log determinant of the prior's information about a spline on unit knots.
+
+    The white derivative is a spline of the differences of the coefficients, whose Gram matrix is banded and well
+    conditioned; differences and the first state are another set of coordinates, of one determinant for all counts.
+    """
+    size, gram = ORDER - white, _gram(white)
+    banded = np.zeros((size, count + size - 1))
+    for i in range(size):
+        for j in range(i + 1):
+            banded[i - j, j : j + count] += gram[i, j]
+    first = np.concatenate([start_basis(Knots(0.0, 1.0, 1, white)), _difference(white)])
+    differences = float(np.log(scipy.linalg.cholesky_banded(banded, lower=True)[0]).sum())
+    return 2 * (differences + float(np.linalg.slogdet(first)[1]))
+
+
+@cache
+def _difference(order: int) -> np.ndarray:
+    """Differences (6 - order, 6) of the coefficients of an interval."""
+    return np.diff(np.eye(ORDER), order, axis=0)
+
+
+@cache
+def _gram(order: int) -> np.ndarray:
+    """Integrals (6 - order, 6 - order) of products of the pieces of a cardinal B-spline of degree 5 - order."""
+    size = ORDER - order
+    pieces = np.array({3: [[0.5, 0.5, 0], [-1, 1, 0], [0.5, -1, 0.5]], 4: [[1, 0], [-1, 1]], 5: [[1]]}[order], float)
+    return np.asarray(pieces.T @ scipy.linalg.hilbert(size) @ pieces)
 
 
 @cache

@@ -123,11 +123,11 @@ def _reading_sensitivities(
     """
     N, _, n_o = linear.direct.shape
     n_o -= len(reading_parameters)
-    count = linear.chain.Z.shape[0] - 1
+    count = linear.drive.shape[2] - 1
     sensitivities = np.empty((N, len(sensors), count), np.float32)
     H = linear.H[:, sensors]
     for k in range(0, count, COLUMNS_AT_A_TIME):
-        sensitivities[:, :, k : k + COLUMNS_AT_A_TIME] = H @ linear.chain.slopes(slice(k, k + COLUMNS_AT_A_TIME))
+        sensitivities[:, :, k : k + COLUMNS_AT_A_TIME] = H @ linear.state_slopes(slice(k, k + COLUMNS_AT_A_TIME))
     direct_columns = [*reading_parameters, *range(count - n_o, count)]
     sensitivities[:, :, direct_columns] += linear.direct[:, sensors]
     return sensitivities

@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 
 from excite.logs import integrate_pose
+from excite.model import Model
 from excite.model.machine import Body
 from excite.simulation import smooth_part
 from excite.smoothing.linearisation import SLOPES, StateSpace, feature_names
@@ -215,14 +216,30 @@ def catalogue(
             else:
                 index = np.arange(total, total + e.count)
                 total += e.count
-            before = known.index if known is not None else ()
-            groups[e.name] = Group(e.name, e.unit, e.typical, (*before, index), e.period)
+            before, largest = (known.index, known.typical) if known is not None else ((), 0.0)
+            groups[e.name] = Group(e.name, e.unit, max(e.typical, largest), (*before, index), e.period)
             for place, shapes in e.inputs:
                 form, course = (shapes, None) if callable(shapes) else (None, e.typical * shapes)
                 (readings if e.reading else inputs).append(Term(columns, place, e.typical, course, form))
             at += e.count
         lacking.append(Lacking(tuple(inputs), tuple(readings), at, force_std))
-    return UnknownForces(tuple(lacking), tuple(groups.values()), np.ones(len(groups)))
+    errors = _constant_errors(space.model, groups, speeds)
+    return UnknownForces(tuple(lacking), tuple(groups.values()), np.ones(len(groups)), errors)
+
+
+def _constant_errors(model: Model, groups: Mapping[str, Group], speeds: Mapping[int, float]) -> np.ndarray:
+    """Return the typical constant error (n_base,) [SI] of offsets, frictions and stiffnesses: as their slow changes."""
+    found = dict[str, float]()
+    stiffness = {"Kx{}": "lengthwise stiffness", "Ky{}": "lateral stiffness"}
+    kinds = {"u{}0": "torque", "Fs{}": "friction", "Fv{}": "friction", **stiffness}
+    for body in model.machine.body:
+        for name, kind in kinds.items():
+            if group := groups.get(f"{body.where}: {kind}, slow"):
+                found[name.format(body.index)] = group.typical
+    own = [model.base.standard[k] for k in model.base.independent]  # whatever the base parameters are called
+    units = {f"Fv{k}": 1 / fast for k, fast in speeds.items()}
+    units |= {n: abs(x) for n, x in zip(own, model.nominal, strict=True) if n[:2] in ("Kx", "Ky")}
+    return np.array([found.get(n, 0.0) * units.get(n, 1.0) for n in own])
 
 
 def _ranges(
@@ -241,7 +258,7 @@ LARGE_QUANTILE = 0.998  # of a speed or slip, at which its curves end
 FRICTION_KNOTS = np.array([0.0, 0.03, 0.12, 0.35, 1.0])  # of the fast speed; dense where Stribeck friction is
 FRICTION_CORRELATION = 0.8  # of a friction curve between neighbouring knots
 SOIL_KNOTS = np.linspace(0.0, 1.0, 6)  # of the large slip
-SOIL_PERIODS = 2  # slow courses of what changes with time, beside a constant: its mean is not the parameter's value
+SLOW_COURSES = 2  # of a friction or stiffness that changes with time; see `UnknownForces.constant_errors`
 
 
 def _entries(
@@ -274,22 +291,18 @@ def _entries(
         large = float(np.quantile(np.abs(u[:, k]), 0.99))
         where, unit = body.where, "N m" if body.joint == "revolute" else "N"
         smoothing = float(body.friction.smoothing) if body.friction is not None else 1e-3 * speeds[body.index]
-        w = features[:, names.index(("rate", body.index))]
-        curves = partial(
-            friction_curves,
-            rate=names.index(("rate", body.index)),
-            knots=FRICTION_KNOTS * speeds[body.index],
-            smoothing=smoothing,
-            mix=mix,
-        )
-        usual = 0.02 * large if body.friction is None else max(0.02 * large, 0.3 * float(body.friction.Fs))
+        own, fast = names.index(("rate", body.index)), speeds[body.index]
+        knots = FRICTION_KNOTS * fast
+        curves = partial(friction_curves, rate=own, knots=knots, smoothing=smoothing, mix=mix)
+        lacking = 0.02 * large
+        usual = lacking if body.friction is None else max(lacking, 0.3 * float(body.friction.Fs))
         add(f"{where}: torque with speed", unit, usual, curves, k, 2 * len(FRICTION_KNOTS))
         half = slow[:, : slow.shape[1] // 2]
         add(f"{where}: torque, slow", unit, 0.005 * large, half, k, half.shape[1], 2 * duration / half.shape[1])
         gentle = smooth_part(u[:, k])
-        changing = np.column_stack([np.ones(len(t)), slow[:, :SOIL_PERIODS]])
-        warming = np.column_stack([f * c for f in (w / speeds[body.index], np.tanh(w / smoothing)) for c in changing.T])
-        add(f"{where}: friction, slow", unit, 0.02 * large, warming, k, warming.shape[1], 2 * duration / SOIL_PERIODS)
+        w, course = features[:, own, None], slow[:, :SLOW_COURSES]
+        warming = np.hstack([w / fast * course, np.tanh(w / smoothing) * course])
+        add(f"{where}: friction, slow", unit, lacking, warming, k, warming.shape[1], 2 * duration / SLOW_COURSES)
         rise = np.gradient(gentle) * rate
         add(f"{where}: torque late", "s", 0.01, -rise[:, None], k, 1)
         if body.contact is not None:
@@ -297,7 +310,7 @@ def _entries(
             harmonics = np.column_stack([f(h * turned) for h in (1, 2) for f in (np.sin, np.cos)])
             add(f"{where}: torque with angle", unit, 0.005 * large, harmonics, k, 4)
     for body in machine.contacts:
-        found += _contact_entries(space, body, features, X, slips, slow, rate)
+        found += _contact_entries(space, body, features, slips, slow, rate)
     found += _slope_entries(space, q, nu, rate)
     for j, sensor in enumerate(space.sensors):
         if sensor.kind == "wheel":
@@ -310,7 +323,6 @@ def _contact_entries(
     space: StateSpace,
     body: Body,
     features: np.ndarray,
-    X: np.ndarray,
     slips: Mapping[tuple[str, int], float],
     slow: np.ndarray,
     rate: float,
@@ -324,53 +336,46 @@ def _contact_entries(
     rates = dict(zip(feature_names(model), features.T, strict=True))
     rim = float(body.contact.radius) * rates.get(("rate", k), np.zeros(len(features)))
     speed = np.hypot(rim, SLOW_SPEED)
-    standard = dict(zip(model.base.standard, model.expand @ X, strict=True))
+    # Not the estimate: shapes that grow with it would let both grow without end.
+    standard = dict(zip(model.base.standard, model.expand @ model.nominal, strict=True))
     Kx, Ky = abs(standard[f"Kx{k}"]), abs(standard[f"Ky{k}"])
     largest = float(np.hypot(slips["gx", k], slips["gy", k]))
-    found, knots, duration = list[_Entry](), SOIL_KNOTS * largest, (len(slow) - 1) / rate
+    found, duration = list[_Entry](), (len(slow) - 1) / rate
 
     def add(
-        name: str, unit: str, typical: float, shapes: np.ndarray | Form, kind: str, count: int, period: float = 0.0
+        name: str, unit: str, typical: float, shapes: Mapping[str, np.ndarray | Form], count: int, period: float = 0.0
     ) -> None:
-        every = ((place[kind], shapes),)
+        every = tuple((place[kind], own) for kind, own in shapes.items())
         found.append(_Entry(f"{where}: {name}", unit, typical, period == 0, every, count, False, period))
 
-    for kind, own, other, K in (("lengthwise", "gx", "gy", Kx), ("lateral", "gy", "gx", Ky)):
-        if kind not in place:
-            continue
-        g = features[:, feature[own]]
-        curves = partial(soil_curves, along=feature[own], across=feature[other], stiffness=K, knots=knots)
-        add(f"{kind} stiffness with slip", "-", 0.1, curves, kind, len(SOIL_KNOTS) - 1)
-        changing = -K * g[:, None] * np.column_stack([np.ones(len(g)), slow[:, :SOIL_PERIODS]])
-        add(f"{kind} stiffness, slow", "-", 0.05, changing, kind, changing.shape[1], 2 * duration / SOIL_PERIODS)
-        relaxing = K * np.gradient(smooth_part(g)) * rate / speed
-        add(f"{kind} force late", "m", 0.02, relaxing[:, None], kind, 1)
-        add(f"{kind} force, slow", "N", 50.0, slow, kind, slow.shape[1], 2 * duration / slow.shape[1])
+    # The lengthwise stiffness makes the turning moment as well: forces, by what they are proportional to.
+    laws = {"lengthwise": {"lengthwise": ("gx", -Kx)}, "lateral": {"lateral": ("gy", -Ky)}}
     if "turning" in place:
-        moment = -Kx * float(body.contact.width) / 6
-        curves = partial(
-            soil_curves,
-            along=feature["turn"],
-            across=feature["turn"],
-            stiffness=moment,
-            knots=SOIL_KNOTS * max(slips["turn", k], 1e-6) * np.sqrt(2),
-        )
-        add("turning moment with slip", "-", 0.1, curves, "turning", len(SOIL_KNOTS) - 1)
-        turn = smooth_part(features[:, feature["turn"]])
-        add("turning moment late", "m", 0.02, (moment * np.gradient(turn) * rate / speed)[:, None], "turning", 1)
+        assert body.contact.width is not None
+        laws["lengthwise"]["turning"] = ("turn", -Kx * float(body.contact.width) / 6)
+    for stiffness, law in laws.items():
+        if stiffness not in place:
+            continue
+        changing = {kind: f * features[:, [feature[x]]] * slow[:, :SLOW_COURSES] for kind, (x, f) in law.items()}
+        add(f"{stiffness} stiffness, slow", "-", 0.05, changing, SLOW_COURSES, 2 * duration / SLOW_COURSES)
+        add(f"{stiffness} force, slow", "N", 50.0, {stiffness: slow}, slow.shape[1], 2 * duration / slow.shape[1])
+        for kind, (x, factor) in law.items():
+            across = {"gx": "gy", "gy": "gx"}.get(x, x)
+            end = np.sqrt(2) * max(slips["turn", k], 1e-6) if x == "turn" else largest
+            curves = partial(
+                soil_curves, along=feature[x], across=feature[across], stiffness=-factor, knots=SOIL_KNOTS * end
+            )
+            changed, force = (f"{kind} stiffness", f"{kind} force") if x != "turn" else ("turning moment",) * 2
+            add(f"{changed} with slip", "-", 0.1, {kind: curves}, len(SOIL_KNOTS) - 1)
+            relaxing = -factor * np.gradient(smooth_part(features[:, feature[x]])) * rate / speed
+            add(f"{force} late", "m", 0.02, {kind: relaxing[:, None]}, 1)
     if ("rate", k) in feature_names(model):
         at = feature_names(model).index(("rate", k))
         if "lengthwise" in place:
-            add(
-                "stiffness in braking",
-                "-",
-                0.05,
-                partial(braking, gx=feature["gx"], rate=at, stiffness=Kx),
-                "lengthwise",
-                1,
-            )
+            driven = partial(braking, gx=feature["gx"], rate=at, stiffness=Kx)
+            add("stiffness in braking", "-", 0.05, {"lengthwise": driven}, 1)
         if "resistance" in place:
-            add("resistance", "N", 150.0, partial(resistance, rate=at), "resistance", 1)
+            add("resistance", "N", 150.0, {"resistance": partial(resistance, rate=at)}, 1)
     return found
 
 
@@ -394,12 +399,14 @@ class UnknownForces:
     """What the model lacks along several logs, with the size of each group.
 
     lacking: of each log; their shapes are per unit of the typical size. size (n_groups,): standard deviation of the
-    coefficients of each group, over its typical size.
+    coefficients of each group, over its typical size. constant_errors (n_base,): typical size [SI] of what acts as
+    another value of a parameter all the time, which no log can tell from the parameter.
     """
 
     lacking: tuple[Lacking, ...]
     groups: tuple[Group, ...] = ()
     size: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    constant_errors: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def count(self) -> int:

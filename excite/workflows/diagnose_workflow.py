@@ -12,11 +12,10 @@ from typing import Any
 
 from excite import diagnosis, identification, reports
 from excite.diagnosis import Assessment, Diagnosis, RivalPair, TorqueDiagnosis, run_forked
-from excite.errors import InfeasibleError, MachineError, NotIdentifiableError, SimulationError
-from excite.identification import FILTERS
+from excite.errors import InfeasibleError, MachineError, NotIdentifiableError, SimulationError, StoppedError
 from excite.logs import Log, Prepared, doubts_in_errors, examine, moves, prepare
 from excite.model import Model, build, signal_descriptions
-from excite.model.machine import Filter, Machine
+from excite.model.machine import Machine
 from excite.reports import Account, Explorable
 from excite.workflows import design_request, design_workflow, requests
 from excite.workflows.design_request import DesignRequest
@@ -28,24 +27,22 @@ NEXT = "next"  # folder of the drive that separates tied causes
 
 @dataclass(frozen=True)
 class PreparedLogs:
-    """Repaired logs with the notes and doubts of the repair, and the filter of the first guess."""
+    """Repaired logs with the notes and doubts of the repair."""
 
     logs: list[Log]
     notes: list[str]
     doubts: list[str]
-    filter: Filter
 
 
-def _prepare_logs(model: Model, logs: Sequence[Log], filtering: str) -> PreparedLogs:
+def _prepare_logs(model: Model, logs: Sequence[Log]) -> PreparedLogs:
     examined = [examine(model.machine, one) for one in logs]
     repaired = [e.log for e in examined]
     doubts = [line for e in examined for line in e.doubts]
     if not any(moves(model.machine, one) for one in repaired):
         sources = ", ".join(one.source for one in repaired)
         raise NotIdentifiableError(f"{sources}: nothing moves, which shows no cause; give a log of a drive as well")
-    chosen, reason = FILTERS[filtering](model, repaired)
-    notes = [note for e in examined for note in e.notes] + doubts + ([reason] if reason else [])
-    return PreparedLogs(repaired, notes, doubts, chosen)
+    notes = [note for e in examined for note in e.notes] + doubts
+    return PreparedLogs(repaired, notes, doubts)
 
 
 @dataclass(frozen=True)
@@ -60,20 +57,18 @@ class DiagnoseResult:
 def diagnose_from(
     model: Model,
     logs: Sequence[Log],
-    filtering: str = "machine",
     report: Callable[[float, str], None] = lambda share, what: None,
     budget_s: float | None = None,
 ) -> DiagnoseResult:
     """Diagnose checked logs and measure the gain of each finding.
 
-    filtering: a name of `FILTERS`, used for the first guess.
     report(share of the work, what is being done): called now and then.
     budget_s [s]: ends the search with the best answer so far.
     Raises LogError, NotIdentifiableError, NoEstimateError.
     """
-    prepared = _prepare_logs(model, logs, filtering)
+    prepared = _prepare_logs(model, logs)
     with doubts_in_errors(prepared.doubts):
-        assessment = diagnosis.explain(model, prepared.logs, prepared.filter, report, run_forked, budget_s)
+        assessment = diagnosis.explain(model, prepared.logs, model.machine.filter, report, run_forked, budget_s)
     notes = [*prepared.notes, *_baseline_note(assessment.diagnosis)]
     if assessment.cut_short:
         notes.append(
@@ -87,7 +82,6 @@ def diagnose(
     place: Path,
     machine: str,
     logs: Sequence[Path],
-    filtering: str = "machine",
     design_next: bool = False,
     bar: Bar = no_bar,
     budget_s: float | None = None,
@@ -96,7 +90,7 @@ def diagnose(
 ) -> dict[str, Any]:
     """Diagnose logs into a folder: report, figures, and machine.toml if a cause is named; return the summary.
 
-    machine: a shipped name or a path. filtering: a name of `FILTERS`. design_next: design the drive that separates
+    machine: a shipped name or a path. design_next: design the drive that separates
     tied causes. budget_s [s]: ends the search with the best answer so far, and the count of false alarms. accepted:
     why doubts about the logs may stand. false_alarms: number of clean simulated logs of the fitted machine that are
     diagnosed as well.
@@ -107,7 +101,7 @@ def diagnose(
     with bar("diagnosing") as advance:
         ready = prepare(model, logs, identification.needed_sensors(model, "joint"))
         found = diagnose_from(
-            ready.model, ready.logs, filtering, lambda share, what: advance(round(1000 * share), 1000, what), budget_s
+            ready.model, ready.logs, lambda share, what: advance(round(1000 * share), 1000, what), budget_s
         )
     left = None if budget_s is None else budget_s - (time.monotonic() - begin)
     counted, note = _count_false_alarms(found, false_alarms, bar, left) if false_alarms else (None, "")
@@ -230,9 +224,10 @@ def separating_drive(
             request = DesignRequest("discrimination", between=between)
             try:
                 made = design_workflow.design_model(place / NEXT, model, name, problem, request, bar)
-            except (InfeasibleError, MachineError, SimulationError, KeyboardInterrupt) as failed:
+            except (InfeasibleError, MachineError, SimulationError, KeyboardInterrupt, StoppedError) as failed:
                 shutil.rmtree(place / NEXT)
-                return drive | {"failed": str(failed) or "interrupted"}
+                said = failed.why if isinstance(failed, StoppedError) else str(failed)
+                return drive | {"failed": said or "interrupted"}
             sigma = max(made["sigma_percent"][x.partition("=")[0]] for x in between)
             drive |= {"folder": NEXT, "sigma_percent": sigma, "complete": made["complete"]}
         return drive

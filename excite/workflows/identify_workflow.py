@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from excite import identification, reports
 from excite.errors import LogError, NoEstimateError, NotIdentifiableError, SimulationError
-from excite.identification import FILTERS, Agreement, Estimate, SignalComparison, describe_late_channels
+from excite.identification import Agreement, Estimate, SignalComparison, describe_late_channels
 from excite.logs import Log, Prepared, examine, moves, prepare
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Filter
@@ -26,23 +26,19 @@ from excite.workflows.residuals import describe_residuals
 
 @dataclass(frozen=True)
 class IdentifyResult:
-    """An estimate with its notes, the repaired logs it is from, and the filter that was used.
-
-    agreement: of several logs, None for one.
-    """
+    """An estimate with its notes and the repaired logs it is from. agreement: of several logs, None for one."""
 
     estimate: Estimate
     logs: list[Log]
-    filter: Filter
     agreement: Agreement | None = None
 
 
-def identify_from(model: Model, logs: Sequence[Log], method: str, filtering: str = "machine") -> IdentifyResult:
+def identify_from(model: Model, logs: Sequence[Log], method: str) -> IdentifyResult:
     """Estimate parameters from checked logs, with the method's bias and notes on values and late channels.
 
-    filtering: a name of `FILTERS`. Raises NoEstimateError, LogError.
+    Raises NoEstimateError, LogError.
     """
-    chosen, reason = FILTERS[filtering](model, logs)
+    chosen = model.machine.filter
     agreement, _ = identification.compare_sources(model, logs, method, chosen)
     try:
         estimate = identification.identify(model, logs, method, chosen)
@@ -68,11 +64,10 @@ def identify_from(model: Model, logs: Sequence[Log], method: str, filtering: str
         late = []  # the alignment is one of the tests
     elif late and estimate.status == "valid":
         estimate = replace(estimate, status="doubtful", doubt=late[0])
-    first = (reason,) if reason else ()
-    notes = (*first, *estimate.notes, *identification.far_from_nominal(model, estimate), *late)
+    notes = (*estimate.notes, *identification.far_from_nominal(model, estimate), *late)
     estimate = identification.add_consistent(model, replace(estimate, notes=notes))
     used = identification.corrected_logs(model, used, method, chosen)
-    return IdentifyResult(estimate, used, chosen, agreement)
+    return IdentifyResult(estimate, used, agreement)
 
 
 def identify(
@@ -80,7 +75,6 @@ def identify(
     machine: str,
     logs: Sequence[Path],
     method: str | None = None,
-    filtering: str = "machine",
     validate: Sequence[Path] = (),
     bar: Bar = no_bar,
     unloaded: Path | None = None,
@@ -88,7 +82,7 @@ def identify(
 ) -> dict[str, Any]:
     """Estimate parameters from logs into a folder; return the summary.
 
-    machine: a shipped name or a path. method: None for the recommended one. filtering: a name of `FILTERS`.
+    machine: a shipped name or a path. method: None for the recommended one.
     validate: logs that are not fitted, only predicted. unloaded: folder of an estimate of the machine without the
     payload that it carries in the logs. accepted: why doubts about the logs may stand.
     Raises LogError, NoEstimateError, UsageError, EstimateFolderError, MachineError for a machine that `check` refuses.
@@ -110,8 +104,8 @@ def identify(
             raise LogError(f"{one.source}: nothing moves in it, so it validates nothing: give a log of motion")
     more_notes = [*(others.notes if others else ()), *(line for e in examined for line in (*e.notes, *e.doubts))]
     with bar("identifying"):
-        found = identify_from(model, ready.logs, method, filtering)
-    unfitted = identification.corrected_logs(model, unfitted, method, found.filter)
+        found = identify_from(model, ready.logs, method)
+    unfitted = identification.corrected_logs(model, unfitted, method, model.machine.filter)
     return identify_account(as_in_file, ready, found, unfitted, more_notes, before, accepted).write(place)
 
 
@@ -129,7 +123,7 @@ def identify_account(
     as_in_file: the model before it had the rate of the logs. more_notes: on the logs that were not fitted.
     unloaded: estimate without the payload. accepted: why doubts about the logs may stand.
     """
-    model, read, estimate, chosen = ready.model, found.logs, found.estimate, found.filter
+    model, read, estimate, chosen = ready.model, found.logs, found.estimate, ready.model.machine.filter
     compared = [identification.compare_torques(model, one, estimate, chosen) for one in read]
     said = [] if found.agreement is None else [identification.describe_agreement(found.agreement)]
     checks = [_check(model, one, read, estimate, chosen) for one in unfitted]
@@ -205,7 +199,7 @@ def _figures(
     """Return what draws each figure, by file name. nominal (n,): values of the machine file."""
     every: tuple[tuple[str, list[Callable[[], Figure]]], ...] = (
         ("fit", [partial(_fit_figure, model, *both) for both in zip(found.logs, compared, strict=True)]),
-        ("validation", [partial(_validation_figure, model, one, estimate, found.filter) for one in unfitted]),
+        ("validation", [partial(_validation_figure, model, one, estimate, model.machine.filter) for one in unfitted]),
     )
     figures = {
         f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png": draw

@@ -292,7 +292,7 @@ def _rounded_angles(model: Model) -> Iterator[str]:
     for b in model.machine.body:
         for key in ("gamma", "alpha", "theta"):
             value = float(getattr(b, key))
-            taken = mechanics.round_angle(value)
+            taken = mechanics.fixed_angle(getattr(b, key))
             if abs(value - taken) > 1e-7:  # beyond the digits of pi that everyone writes
                 yield f"{b.name}: {key}: {value:.10g} rad is taken for {taken:.10g}, a multiple of pi/4"
 
@@ -410,8 +410,8 @@ DOUBTS: tuple[Callable[[Model], Iterator[str]], ...] = (
 def describe_invisible(model: Model) -> Iterator[str]:
     """Yield the standard parameters, other than zero, that no drive shows, with the reason."""
     machine = model.machine
-    table = dict(zip(model.base.standard, _standard(model), strict=True))
-    left = [n for n in model.base.invisible if table[n]]
+    table = {n: v for n, (v, _) in standard_parameters(machine).items()}
+    left = [n for n in model.base.invisible if table.get(n)]
     for b in machine.body:
         held = [c for c in b.coordinates if c in machine.locked]
         if held and b.joint == "planar":
@@ -441,11 +441,6 @@ def _hidden_zeros(model: Model) -> Iterator[str]:
                 f"{name}: no motion shows the encoder zero of {where}, as turning it changes nothing (an axis along"
                 " gravity, or a body that is the same all round): give its zero"
             )
-
-
-def _standard(model: Model) -> list[float]:
-    values = {n: v for n, (v, _) in standard_parameters(model.machine).items()}
-    return [values.get(n, 0.0) for n in model.base.standard]
 
 
 def _random_drive_sigma(model: Model) -> dict[str, float]:

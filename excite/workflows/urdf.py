@@ -70,8 +70,7 @@ class Robot:
 
     def massless(self, k: int) -> bool:
         """True if no link behind joint k has a mass."""
-        found = (self.urdf.links[link] for link, _ in self.attached[k])
-        return not any(given.mass for given in found if given is not None)
+        return not any(given.mass for link, _ in self.attached[k] if (given := self.urdf.links[link]) is not None)
 
 
 def read_robot(path: Path) -> Robot:
@@ -91,7 +90,8 @@ def read_robot(path: Path) -> Robot:
                 attached[carrier].append((joint.child, at))
             place[joint.child] = carrier, at
             continue
-        row, frame = _common_normal(at[:3, :3] @ joint.axis, at[:3, 3])
+        free = carrier is not None and joints[carrier].joint.kind == "revolute" and joints[carrier].joint.mimic is None
+        row, frame = _common_normal(at[:3, :3] @ joint.axis, at[:3, 3], free)
         own = np.linalg.inv(frame) @ at
         place[joint.child] = len(joints), own
         joints.append(JointFrame(joint, carrier, row, own))
@@ -106,10 +106,11 @@ def read_robot(path: Path) -> Robot:
     return Robot(urdf, tuple(joints), tuple(tuple(a) for a in attached))
 
 
-def _common_normal(axis: np.ndarray, point: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
+def _common_normal(axis: np.ndarray, point: np.ndarray, free: bool) -> tuple[dict[str, float], np.ndarray]:
     """Return the row (gamma, b, alpha, d) and the frame (4, 4) of a joint's axis through a point, in the frame before.
 
-    The frame lies where the common normal with the z axis of the frame before meets the axis.
+    The frame lies where the common normal with the z axis of the frame before meets the axis. free: the joint before
+    turns freely, so gamma adds to its angle, may be any and is not rounded.
     """
     z = np.array([0.0, 0.0, 1.0])
     normal = np.cross(z, axis)
@@ -124,21 +125,21 @@ def _common_normal(axis: np.ndarray, point: np.ndarray) -> tuple[dict[str, float
         # b z + d x = point + s axis
         b = float(np.linalg.lstsq(np.column_stack([z, -axis]), point - d * x, rcond=None)[0][0])
         gamma, alpha = math.atan2(x[1], x[0]), math.atan2(sine, float(axis[2]))
-    lengths = {"b": b, "d": d}
-    row = {"gamma": round_angle(gamma), "alpha": round_angle(alpha)}
-    row |= {key: 0.0 if abs(value) < RESIDUE else value for key, value in lengths.items()}
+    rounded = round_angle(gamma)
+    gamma_taken = gamma if free and abs(gamma - rounded) > RESIDUE else rounded
+    b_taken, d_taken = (0.0 if abs(value) < RESIDUE else value for value in (b, d))
+    row = {"gamma": gamma_taken, "b": b_taken, "alpha": round_angle(alpha), "d": d_taken}
     frame = np.eye(4)
-    frame[:3, :3] = Rotation.from_euler("ZX", [row["gamma"], row["alpha"]]).as_matrix()
-    frame[:3, 3] = frame[:3, 0] * row["d"] + z * row["b"]
-    return {key: row[key] for key in ("gamma", "b", "alpha", "d")}, frame
+    frame[:3, :3] = Rotation.from_euler("ZX", [gamma_taken, row["alpha"]]).as_matrix()
+    frame[:3, 3] = d * math.cos(gamma), d * math.sin(gamma), b  # on the axis, whatever was rounded
+    return row, frame
 
 
 def _whole_inertia(robot: Robot, k: int) -> tuple[float, np.ndarray, np.ndarray]:
     """Return mass, centre of mass (3,) and inertia (3, 3) about it of the links behind joint k, zeros without one."""
     parts = []
     for link, at in robot.attached[k]:
-        given = robot.urdf.links[link]
-        if given is not None:
+        if (given := robot.urdf.links[link]) is not None:
             place = at @ given.placement
             R = place[:3, :3]
             parts.append((given.mass, place[:3, 3], R @ given.inertia @ R.T))
@@ -223,6 +224,7 @@ def _body(robot: Robot, k: int, name: str) -> dict[str, Any]:
         ratio = {"joint": leader + 1, "ratio": _given(joint.mimic.multiplier)}
         body["moves_with"] = ratio | ({"offset": _given(joint.mimic.offset)} if joint.mimic.offset else {})
     body |= {key: _given(value) for key, value in frame.row.items()}
+    body["gamma"] |= {"tolerance": 0.0} if round_angle(frame.row["gamma"]) != frame.row["gamma"] else {}
     mass, centre, J = _whole_inertia(robot, k)
     said = {"note": "the URDF gives no mass"} if robot.massless(k) else {}
     axes = {"XX": (0, 0), "XY": (0, 1), "XZ": (0, 2), "YY": (1, 1), "YZ": (1, 2), "ZZ": (2, 2)}

@@ -16,11 +16,8 @@ from excite.errors import MachineError
 from excite.model.mechanics import round_angle
 from excite.text import did_you_mean
 
-MOVING: dict[str, Literal["revolute", "prismatic"]] = {
-    "revolute": "revolute",
-    "continuous": "revolute",
-    "prismatic": "prismatic",
-}
+Kind = Literal["revolute", "prismatic", "fixed"]
+MOVING: dict[str, Kind] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 MAX_BYTES = 20_000_000  # of a file; the largest public ones have 0.3 MB
 MAX_NUMBER = 1e9  # in SI units, of any number but a limit
 LONGEST_WORD = 120  # characters of a name or value in a message
@@ -53,7 +50,7 @@ class Joint:
     """
 
     name: str
-    kind: Literal["revolute", "prismatic", "fixed"]
+    kind: Kind
     parent: str
     child: str
     placement: np.ndarray
@@ -132,6 +129,8 @@ class _Reader:
             self.refuse(f"{where}: mass: must be 0 or above (got {m:g})")
         tensor = np.zeros((3, 3))
         inertia = given.find("inertia")
+        if m and inertia is None:
+            self.notes.append(f"{where}: has a mass but no inertia in the URDF, so it is a point mass here")
         for i, a in enumerate("xyz"):
             for j, b in enumerate("xyz"[i:], start=i):
                 text = inertia.get(f"i{a}{b}", "0") if inertia is not None else "0"
@@ -145,9 +144,9 @@ class _Reader:
         where = f"joint {name}"
         said = element.get("type", "")
         if said != "fixed" and said not in MOVING:
-            self.refuse(
-                f"{where}: type {said or '(none)'} has no place in a machine file, allowed: fixed, {', '.join(MOVING)}"
-            )
+            still = " (if the base does not move while it is measured)" if said in ("floating", "planar") else ""
+            allowed = f"fixed{still}, {', '.join(MOVING)}"
+            self.refuse(f"{where}: type {said or '(none)'} has no place in a machine file, allowed: {allowed}")
         ends = [element.find(end) for end in ("parent", "child")]
         parent, child = ("" if end is None else end.get("link", "") for end in ends)
         if not parent or not child:
@@ -161,35 +160,27 @@ class _Reader:
         for tag, keys in (("limit", ("lower", "upper", "effort", "velocity")), ("dynamics", ("damping", "friction"))):
             found = element.find(tag)
             for key in keys:
-                text = None if found is None else found.get(key)
+                text = None if found is None else found.get(key, "0" if key in ("lower", "upper") else None)
                 value = None if text is None else self.number(where, f"{tag} {key}", text, math.inf)
                 numbers[key] = value if value is None or abs(value) < NO_LIMIT else None
         for key in ("effort", "velocity", "damping", "friction"):
             if (numbers[key] or 0.0) < 0:
                 self.refuse(f"{where}: {key}: must be 0 or above (got {numbers[key]:g})")
         low, high = numbers["lower"] or 0.0, numbers["upper"] or 0.0
-        ranged = said != "continuous" and None not in (numbers["lower"], numbers["upper"]) and low < high
+        ranged = said in ("revolute", "prismatic") and None not in (numbers["lower"], numbers["upper"])
+        if ranged and low >= high:
+            ranged = False
+            self.notes.append(f"{where}: lower {low:g} is not below upper {high:g}: the joint has no limits here")
         mimic = element.find("mimic")
         follows = None
         if mimic is not None and said != "fixed":
             factor = self.number(where, "mimic multiplier", mimic.get("multiplier", "1"))
             shift = self.number(where, "mimic offset", mimic.get("offset", "0"))
             follows = Mimic(mimic.get("joint", ""), factor, shift)
-        return Joint(
-            name,
-            MOVING.get(said, "fixed"),
-            parent,
-            child,
-            self.placement(where, element),
-            along / (size or 1.0),
-            low if ranged else None,
-            high if ranged else None,
-            numbers["effort"] or None,
-            numbers["velocity"] or None,
-            numbers["damping"],
-            numbers["friction"],
-            follows,
-        )
+        at, direction = self.placement(where, element), along / (size or 1.0)
+        span: tuple[float | None, float | None] = (low, high) if ranged else (None, None)
+        given = (numbers["effort"] or None, numbers["velocity"] or None, numbers["damping"], numbers["friction"])
+        return Joint(name, MOVING.get(said, "fixed"), parent, child, at, direction, *span, *given, follows)
 
 
 def parse(path: Path) -> ElementTree.Element:
@@ -248,7 +239,8 @@ def _base(reader: _Reader, links: dict[str, Inertial | None], joints: Sequence[J
             )
     roots = [name for name in links if name not in children]
     if len(roots) != 1:
-        reader.refuse(f"has {len(roots)} links without a joint above them, a robot has one, its base")
+        several = f"links {', '.join(roots)} have no joint above them; a robot has one such link, fix the others to it"
+        reader.refuse(several if roots else "every link has a joint above it: the joints form a loop")
     return roots[0]
 
 
@@ -272,13 +264,15 @@ def _outwards(reader: _Reader, base: str, joints: Sequence[Joint]) -> tuple[Join
 def _with_resolved_mimics(reader: _Reader, joints: Sequence[Joint]) -> Iterator[Joint]:
     """Yield the joints, each that mimics with a leader that moves on its own; a multiplier of 0 makes it fixed."""
     by_name = {j.name: j for j in joints}
+    moving = [j.name for j in joints if j.kind != "fixed"]
     for joint in joints:
         factor, shift, leader, seen = 1.0, 0.0, joint, {joint.name}
         while leader.mimic is not None and factor:
             said = leader.mimic
-            if said.joint not in by_name or by_name[said.joint].kind == "fixed":
-                hint = did_you_mean(said.joint, by_name)
-                reader.refuse(f"joint {leader.name}: mimic: no moving joint {said.joint or '(none)'}{hint}")
+            if said.joint not in moving:
+                unknown = f"no moving joint {said.joint or '(none)'}{did_you_mean(said.joint, moving)}"
+                fixed = f"joint {said.joint} is fixed, name one that moves"
+                reader.refuse(f"joint {leader.name}: mimic: {fixed if said.joint in by_name else unknown}")
             if said.joint in seen:
                 reader.refuse(f"joint {joint.name}: mimics itself through {said.joint}")
             seen.add(said.joint)

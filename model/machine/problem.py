@@ -35,6 +35,9 @@ class Problem(FileRecord):
     start_pose: dict[str, Number] = Field(default={})
     end_pose: dict[str, Number] = Field(default={})
 
+    def __hash__(self) -> int:
+        return hash(self.model_dump_json())
+
     @property
     def lane(self) -> tuple[float, float]:
         """Length and width of the lane [m], infinite without one."""

@@ -1,4 +1,4 @@
-from .angles import round_angle as round_angle
+from .angles import fixed_angle as fixed_angle, round_angle as round_angle
 from .contact import (
     Saturation as Saturation,
     Slip as Slip,

@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from excite.model.machine import Body, Machine
-from excite.model.mechanics.angles import round_angle
+from excite.model.mechanics.angles import fixed_angle
 
 # standard inertial parameters of a body
 INERTIAL = ("M", "MX", "MY", "MZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
@@ -50,7 +50,6 @@ def _snap_to_integer(value: float) -> float:
 
 def _rot_x(angle: float) -> ca.SX:
     """Return the rotation (3, 3) about x by an angle [rad] of the geometry."""
-    angle = round_angle(angle)
     c, s = _snap_to_integer(math.cos(angle)), _snap_to_integer(math.sin(angle))
     return ca.sparsify(ca.SX([[1, 0, 0], [0, c, -s], [0, s, c]]))
 
@@ -58,8 +57,6 @@ def _rot_x(angle: float) -> ca.SX:
 def rot_z(angle: ca.SX | float) -> ca.SX:
     """Return the rotation (3, 3) about z by an angle [rad], a symbol or one of the geometry."""
     number = isinstance(angle, float)
-    if isinstance(angle, float):
-        angle = round_angle(angle)
     c = ca.SX(_snap_to_integer(math.cos(angle))) if number else ca.cos(angle)
     s = ca.SX(_snap_to_integer(math.sin(angle))) if number else ca.sin(angle)
     R = ca.SX.eye(3)
@@ -78,9 +75,9 @@ def joint_transform(body: Body, q: dict[str, ca.SX], longer: ca.SX | float = 0.0
     longer [m]: added to the link's length, along it.
     """
     c = body.coordinates[0] if body.coordinates else ""
-    theta = q[c] if body.joint == "revolute" else float(body.theta)
+    theta = q[c] if body.joint == "revolute" else fixed_angle(body.theta)
     r = q[c] if body.joint == "prismatic" else float(body.r)
-    Rz, Rx, Rt = rot_z(float(body.gamma)), _rot_x(float(body.alpha)), rot_z(theta)
+    Rz, Rx, Rt = rot_z(fixed_angle(body.gamma)), _rot_x(fixed_angle(body.alpha)), rot_z(theta)
     along = ca.vertcat(float(body.d), 0, 0) + Rx @ (Z * r)
     if link_length(body) > 0 and not (isinstance(longer, float) and longer == 0):
         fixed = 0.0 if body.joint == "prismatic" else float(body.r)

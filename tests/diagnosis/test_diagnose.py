@@ -163,7 +163,6 @@ def test_bad_input_is_refused_before_the_work(sloping: Path, tmp_path: Path, exc
         (("va12_straight", tmp_path / "none.csv"), "none.csv"),
         (("va12", sloping), "no column"),
         (("va12_straight", sloping, sloping), "given twice"),
-        (("va12_straight", sloping, "--filter", "best"), "--filter"),
     ):
         code, stdout, stderr = excite("diagnose", *arguments, "--out", tmp_path / "d")
         assert (code, stdout) == (2, "")

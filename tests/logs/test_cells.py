@@ -53,6 +53,22 @@ def test_a_blank_cell_may_mean_no_change() -> None:
     assert "hold the value before" in notes
 
 
+def test_a_few_blank_cells_are_named_with_what_to_do() -> None:
+    few = np.where(np.arange(N) % 50 == 7, np.nan, FORCE)
+    _, notes = read(rig(), table(rig(), force=few))
+    column = next(s.column for s in rig().machine.sensor if s.kind == "torque")
+    assert f"interpolated ({int(np.isnan(few).sum())} in {column}); if the logger writes" in notes
+    assert 'write blank_means = "unchanged"' in notes
+
+
+def test_channels_with_times_of_their_own_have_no_cells_to_fill() -> None:
+    """As in CAN logs and files with a clock per channel: every other row has one of the two."""
+    other = np.arange(N) % 2 == 1
+    _, notes = read(rig(), table(rig(), np.where(other, np.nan, POSITION), np.where(other, FORCE, np.nan)))
+    assert "channels with times of their own" in notes
+    assert "blank_means" not in notes
+
+
 @pytest.mark.parametrize("on", [np.ones(N), ["true"] * N, [True] * N, ["enabled"] * N])
 def test_rows_that_are_not_enabled_are_left_out(on: object) -> None:
     model = rig(enabled_column="drive_on")
@@ -69,6 +85,13 @@ def test_an_enabled_column_that_is_missing_is_said() -> None:
         read(model, table(model))
 
 
+@pytest.mark.parametrize("word", ["falsch", "Switched on", "aus"])
+def test_an_enabled_column_with_other_words_is_refused(word: str) -> None:
+    model = rig(enabled_column="drive_on")
+    with pytest.raises(LogError, match=f"'{word}' says neither on nor off"):
+        read(model, table(model, drive_on=[word] * 300 + ["true"] * (N - 300)))
+
+
 def test_a_register_of_sign_and_magnitude() -> None:
     """As servos give their load: ten bits of it, the eleventh is the sign."""
     model = rig({"sign_bit": 10})
@@ -77,6 +100,8 @@ def test_a_register_of_sign_and_magnitude() -> None:
     assert values["torque"] == pytest.approx(np.round(FORCE))
     with pytest.raises(LogError, match="4000 has bits above its sign_bit 10"):
         read(model, table(model, force=np.where(T == 5, 4000, register)))
+    with pytest.raises(LogError, match="is negative, but a register with a sign_bit is not"):
+        read(model, table(model, force=register.astype(np.int16) - 2000))
 
 
 def test_stamps_of_arrival_are_taken_for_an_even_clock() -> None:

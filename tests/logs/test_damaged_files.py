@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import zipfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -104,6 +106,34 @@ def test_far_cells_of_a_sheet_cost_no_more_than_near_ones(
     answer = child.read(path)
     assert answer.kind == ("refused" if what else "table")
     assert what in answer.what
+
+
+def test_styles_and_sheets_of_a_workbook_cost_little(child: damage.Child, tmp_path: Path) -> None:
+    """openpyxl takes a minute for 20 MB of styles, and reads a sheet as often as the workbook names it."""
+    path = log_files.write_table(log_files.small_table(), tmp_path / "log.xlsx")
+    raw = path.read_bytes()
+    parts = zipfile.ZipFile(path).namelist()
+    styles = partial(re.sub, b"</cellXfs>", b"<xf/>" * 500_000 + b"</cellXfs>")
+
+    def named(times: int, xml: bytes) -> bytes:
+        return re.sub(b"<sheet [^>]*/>", lambda m: m[0] * times, xml)
+
+    rows = b"".join(b"<row><c><v>%d</v></c></row>" % (k * k) for k in range(20_000))
+    cells = partial(re.sub, b"</sheetData>", rows + b"</sheetData>")
+    long = damage.in_zip(raw, cells)
+    alike = damage.in_zip(raw, lambda xml: xml.replace(b"</sheetData>", b"<row/>" * 400_000 + b"</sheetData>"))
+    cases = (
+        (raw, "styles", styles),
+        (alike, "workbook", bytes),
+        (raw, "workbook", partial(named, 501)),
+        (long, "workbook", partial(named, 60)),
+    )
+    for book, part, change in cases:
+        path.write_bytes(damage.in_zip(book, change, parts.index(f"xl/{part}.xml")))
+        answer = child.read(path, ["no such column"])
+        assert answer.kind == ("table" if book is long else "refused")
+        assert answer.seconds < 10
+        assert "more than 500 sheets" in answer.what or book is long
 
 
 def test_a_container_that_unpacks_to_very_much_is_refused(child: damage.Child, tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from support.log_files import (
 
 from excite.errors import LogError
 from excite.logs import FORMATS, read_table
+from excite.logs.files.layout import known_unit
 
 
 @pytest.mark.parametrize("name", ["log.lvm", "log.txt"])
@@ -48,6 +49,16 @@ def test_labview_measurement_files(name: str, x: str, options: dict[str, object]
     assert table["Angle"].to_numpy() == pytest.approx(ANGLE, abs=1e-8)
     assert table["Torque"].to_numpy() == pytest.approx(U, abs=1e-8)
     assert table.attrs["units"] == {"Angle": "rad", "Torque": "N m"}
+
+
+def test_labview_files_without_x_may_leave_its_name_blank_and_write_units_in_words(tmp_path: Path) -> None:
+    file = write_lvm(tmp_path / "log.lvm", "No")
+    text = file.read_text().replace("X_Value\tAngle", "\tAngle").replace("\trad\tN m", "\tRadians\tVolts")
+    file.write_text(text)
+    table = read_table(file)
+    assert table["timestamps"].to_numpy() == pytest.approx(T, abs=1e-6)
+    assert table["Torque"].to_numpy() == pytest.approx(U, abs=1e-8)
+    assert [known_unit(u) for u in table.attrs["units"].values()] == ["rad", "V"]
 
 
 def test_labview_comments_are_no_numbers(tmp_path: Path) -> None:
@@ -152,6 +163,26 @@ def test_a_vector_in_a_cell_becomes_columns(form: str, tmp_path: Path) -> None:
     table = read_table(tmp_path / "log.csv")
     assert table["q[0]"].to_numpy() == pytest.approx(ANGLE)
     assert table["q[1]"].to_numpy() == pytest.approx(2 * ANGLE)
+
+
+@pytest.mark.parametrize("form", ["[{a} {b}]", "[{a}; {b}]", "({a}, {b})", "{{{a};{b}}}"])
+@pytest.mark.parametrize("clock", ["0,01", "1"])
+def test_a_vector_in_a_cell_may_have_decimal_commas(clock: str, form: str, tmp_path: Path) -> None:
+    if clock == "1" and " " not in form.replace("; ", "").replace(", ", ""):
+        pytest.skip("[1,2;3,4] is a matrix where nothing else has a decimal comma")
+    step = float(clock.replace(",", "."))
+    rows = [f"{k * step:g}\t" + form.format(a=f"{a:.6f}", b=f"{-2 * a:.6f}") + "\n" for k, a in enumerate(ANGLE)]
+    (tmp_path / "log.txt").write_text("t\tq\n" + "".join(rows).replace(".", ","))
+    table = read_table(tmp_path / "log.txt")
+    assert list(table.columns) == ["t", "q[0]", "q[1]"]
+    assert table["q[0]"].to_numpy() == pytest.approx(ANGLE, abs=1e-6)
+    assert table["q[1]"].to_numpy() == pytest.approx(-2 * ANGLE, abs=1e-6)
+
+
+@pytest.mark.parametrize("cell", ["[1,2,3]", "[1, 2, 3]", "[1;2;3]", "[1 2 3]"])
+def test_whole_numbers_in_a_cell_are_parted_at_commas(cell: str, tmp_path: Path) -> None:
+    (tmp_path / "log.txt").write_text("t\tq\n" + "".join(f"{k / 100:g}\t{cell}\n".replace(".", ",") for k in range(30)))
+    assert read_table(tmp_path / "log.txt").iloc[5, 1:].tolist() == [1, 2, 3]
 
 
 def test_every_format_has_a_reader_and_an_ending_of_its_own() -> None:

@@ -199,7 +199,7 @@ def test_only_a_log_without_the_machines_columns_is_anothers(va12: Model, table:
             ["kNm in column u1_Nm, the machine file N m", "mm in column theta2_rad, the machine file rad: which"],
             "",
         ),
-        ("s;N m;;Grad", [], "which are not known: Grad for theta2_rad"),
+        ("s;N m;;Grad", [], "units are not known, those of the machine file are taken: Grad for theta2_rad"),
     ],
 )
 def test_units_in_the_file_that_are_not_the_machine_files(
@@ -286,3 +286,22 @@ def test_log_check_command(excite: Excite, table: pd.DataFrame, tmp_path: Path) 
     assert (code, stderr.count("\n")) == (2, 1)
     assert "no such file" in stderr
     assert not (tmp_path / "n").exists()
+
+
+def test_readings_too_large_to_draw_are_left_out(straight: Model, straight_motion: Motion) -> None:
+    table = sensors.measure(straight, straight_motion)
+    signs = np.where(np.arange(len(table)) % 2, 1e308, -1e308)
+    found = inspection.inspect(table.assign(u1_Nm=signs), straight.machine)
+    assert not found.usable
+    for _, x, _ in found.signals.values():
+        assert np.nanmax(np.abs(x), initial=0.0) <= log.LARGEST
+
+
+@pytest.mark.parametrize(("times", "asked"), [(1e-3, True), (1e-300, False)])
+def test_another_unit_is_asked_about_where_one_would_do(
+    straight: Model, straight_motion: Motion, times: float, asked: bool
+) -> None:
+    table = sensors.measure(straight, straight_motion)
+    line = refusal.wrong_time_unit(times * table["t_s"].to_numpy(), straight.machine)
+    assert "rows span" in line
+    assert ("such as min" in line) == asked

@@ -168,6 +168,8 @@ def test_torques_of_the_wrong_size(va12: Model, va12_motion: Motion, name: str) 
     (small,) = plausibility.doubts(va12.machine, one.values | {name: one.values[name] / 1000})
     assert f"column {name}_Nm: the largest torque is" in small
     assert 'is it in kN m? then write unit = "kN m" for it in a machine file' in small
+    (tiny,) = plausibility.doubts(va12.machine, one.values | {name: 1e-9 * one.values[name]})
+    assert tiny.endswith("is its unit in the machine file right?")  # a factor of 1000 would not explain it
     factor = {"u1": 16000, "u2": 48000, "u4": 16000}[name] / np.abs(one.values[name]).max()
     (large,) = plausibility.doubts(va12.machine, one.values | {name: factor * one.values[name]})
     assert f"column {name}_Nm: the largest torque is" in large

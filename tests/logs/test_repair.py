@@ -11,7 +11,7 @@ from support.drives import designed
 from support.logs import make_log
 
 from excite.errors import LogError
-from excite.identification import delays, filter_choice, methods
+from excite.identification import delays, methods
 from excite.logs import Log, log, outliers, repair
 from excite.model import Model
 from excite.simulation import Motion
@@ -174,24 +174,3 @@ def test_noise_of_slips_is_no_delay(va12: Model, monkeypatch: pytest.MonkeyPatch
     told = re.search(r"u1 is late against the motion, by ([0-9.]+) ms .* as far as noise tells", note)
     assert told is not None
     assert 40 < float(told[1]) < 85
-
-
-def test_a_spectrum_sinks_where_noise_begins() -> None:
-    """A band-limited signal of 0-5 Hz above a floor."""
-    rng = np.random.default_rng(0)
-    t = np.arange(6000) / 100
-    x = sum(np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) / (1 + f) for f in np.arange(0.1, 5.0, 0.1))
-    assert filter_choice.noise_floor_frequency(x + 0.01 * rng.standard_normal(len(t)), 100.0) == pytest.approx(
-        5.0, abs=0.5
-    )
-
-
-def test_filters_follow_the_log(straight: Model, clean: Log) -> None:
-    filter, reason = filter_choice.choose_from_spectra(straight, [clean])
-    assert 3 < float(filter.cutoff_hz) < 12
-    assert 0.8 * 50 / filter.decimation >= float(filter.cutoff_hz)
-    assert "noise floor" in reason
-    assert "liveliest" in reason
-    coarse = {k: v + 0.02 * np.random.default_rng(1).standard_normal(len(v)) for k, v in clean.values.items()}
-    lower, _ = filter_choice.choose_from_spectra(straight, [Log("coarse", clean.t, coarse)])
-    assert float(lower.cutoff_hz) < 0.7 * float(filter.cutoff_hz)

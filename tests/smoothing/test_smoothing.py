@@ -39,6 +39,7 @@ from excite.smoothing import (
     smoothed_motion,
     uncertainty,
 )
+from excite.smoothing.innovations import LinearisedLog
 from excite.smoothing.measurements import beat_inflation
 
 
@@ -104,14 +105,28 @@ def test_chain_agrees_with_dense_algebra() -> None:
     rng = np.random.default_rng(0)
     K, n, c = 13, 4, 3
     A, b = rng.normal(size=(K, n, n)) / 2, rng.normal(size=(K, n, c))
-    root, H = rng.normal(size=(K, n, 2)), rng.normal(size=(K, 2, n))
-    C, J = root @ root.transpose(0, 2, 1), H.transpose(0, 2, 1) @ H
-    eta = H.transpose(0, 2, 1) @ rng.normal(size=(K, 2, c))
-    A[0], J[0], eta[0], C[0] = 0, 0, 0, np.eye(n)
-    A[-1], b[-1], C[-1] = 0, 0, 0
-    stages = parallel_smoother.Elements(A, b, C, eta, J)
-    cuts = (slice(0, 5), slice(5, 6), slice(6, None))
-    solved = parallel_smoother.smooth_chain([parallel_smoother.combine(stages.part(cut)) for cut in cuts])
+    root, H, y = rng.normal(size=(K, n, 2)), rng.normal(size=(K, 2, n)), rng.normal(size=(K, 2, c))
+    H[0], y[0], b[0, :, 1:] = 0, 0, 0
+    C, J, eta = root @ root.transpose(0, 2, 1), H.transpose(0, 2, 1) @ H, H.transpose(0, 2, 1) @ y
+    A[0], C[0], A[-1], b[-1], C[-1] = 0, np.eye(n), 0, 0, 0
+    elements = parallel_smoother.Elements(A, C, J)
+    parts = [elements.part(cut) for cut in (slice(0, 1), slice(1, 5), slice(5, 6), slice(6, None))]
+    chain = parallel_smoother.smooth_chain([parallel_smoother.combine(part) for part in parts])
+    ones, readings = np.ones((K - 1, 2)), (y[1:, :, 0], -y[1:, :, 1:])
+    solved = LinearisedLog(
+        chain,
+        b[1:],
+        b[0, :, 0],
+        root,
+        tuple(parts[1:]),
+        H[1:],
+        ones,
+        *readings,
+        ones,
+        ones,
+        np.arange(2),
+        np.arange(1, c),
+    )
 
     N = K - 1
     mean, P, info, pull = np.zeros((N, n, c)), np.zeros((N, n, N, n)), np.zeros((N, n, N, n)), np.zeros((N, n, c))
@@ -127,6 +142,7 @@ def test_chain_agrees_with_dense_algebra() -> None:
     m, P, info, pull = mean.reshape(N * n, c), P.reshape(N * n, -1), info.reshape(N * n, -1), pull.reshape(N * n, c)
     G = np.linalg.inv(np.eye(N * n) + P @ info)
     Z = m.T @ info @ G @ m - pull.T @ G @ m - (pull.T @ G @ m).T - pull.T @ G @ P @ pull
+    Z += np.einsum("kmc,kmd->cd", y, y)
     np.testing.assert_allclose(solved.Z, (Z + Z.T) / 2, rtol=0, atol=1e-9 * np.abs(Z).max())
     p = np.array([0.3, -0.7])
     weights = np.array([1.0, *p])
@@ -137,7 +153,9 @@ def test_chain_agrees_with_dense_algebra() -> None:
         np.testing.assert_allclose(x[k], A[k] @ x[k - 1] + b[k] @ weights + C[k] @ slope[k], atol=1e-9)
     still = solved.states(np.zeros(2))[0]
     for j, move in enumerate(np.eye(2)):
-        np.testing.assert_allclose(solved.slopes(slice(j, j + 1))[:, :, 0], solved.states(move)[0] - still, atol=1e-9)
+        np.testing.assert_allclose(
+            solved.state_slopes(slice(j, j + 1))[:, :, 0], solved.states(move)[0] - still, atol=1e-9
+        )
 
 
 def test_an_effect_may_use_any_elementary_function() -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -17,11 +19,13 @@ from excite.model.effects import placing
 from excite.model.machine.machine import load_machine
 from excite.simulation import Motion, simulate
 from excite.smoothing import (
+    Fit,
     LinearisedLog,
     Measurements,
     Settings,
     StateSpace,
     Trajectory,
+    average_over_sizes,
     build_state_space,
     common_sensors,
     describe_missing,
@@ -31,10 +35,12 @@ from excite.smoothing import (
     lacks_forces,
     log_variance,
     prepare_logs,
+    sizes,
 )
 from excite.smoothing.innovations import expected_squares
+from excite.smoothing.log_fit import Determinant, linearise_with
 from excite.smoothing.sizes import FORCES
-from excite.smoothing.unknown_forces import catalogue
+from excite.smoothing.unknown_forces import Group, Lacking, UnknownForces, catalogue
 
 SUPPORT = Path(__file__).parents[1] / "support"
 
@@ -102,6 +108,32 @@ def test_slopes_of_the_innovations_determinant(name: str) -> None:
     np.testing.assert_allclose(explained, [change(np.zeros(n), s) / 4e-3 for s in 1e-3 * np.eye(n_u)], rtol=1e-3)
 
 
+def test_constant_errors_are_shares_of_stiffness_and_torque(va12: Model) -> None:
+    motion = simulate(va12, drive(va12, 6, 0, dict.fromkeys(va12.inputs, 1200.0)))
+    space, (data,), (start,), _ = prepared(va12, make_log(va12, motion, seed=1))
+    names = list(va12.base.names)
+    typical = catalogue(space, [(data, start)], va12.nominal, np.zeros(len(space.forces))).constant_errors
+    assert typical[names.index("Kx1")] == pytest.approx(0.05 * abs(va12.nominal[names.index("Kx1")]))
+    large = np.quantile(np.abs(data.torque[:, 0]), 0.99)
+    assert typical[names.index("Fs1")] == pytest.approx(0.02 * large, rel=0.1)
+    assert typical[names.index("u10")] == pytest.approx(0.005 * large, rel=0.1)
+    assert {n for n, x in zip(names, typical, strict=True) if x} == {n for n in names if n[0] in "uFK"}
+
+
+def test_the_pull_of_the_determinant_moves_values_and_is_no_information(straight: Model, S40: Motion) -> None:
+    space, measurements, starts, held = prepared(straight, make_log(straight, S40, seed=1))
+    exact = fit_logs(space, measurements, starts, straight.nominal, starts, held)
+    slope = np.zeros(len(held))
+    slope[0] = -0.1 * exact.information[0, 0]
+    pull = Determinant(slope, exact.X, np.zeros(0), np.zeros(0))
+    pulled = fit_logs(space, measurements, exact.trajectories, exact.X, starts, held, pull=pull)
+    assert pulled.status == "converged"
+    assert pulled.X[0] > exact.X[0] + 3 * exact.std[0]
+    alone = linearise_with(space, measurements, pulled.trajectories, pulled.X, starts, held, pulled.unknown)
+    assert alone is not None
+    np.testing.assert_allclose(pulled.std, alone.std, rtol=2e-3)
+
+
 @pytest.mark.slow
 @pytest.mark.xfail(reason="the mass is 2.5 % too small, as curves of soil and friction take a part", strict=False)
 def test_hidden_effects_are_told_and_leave_the_mass_right(straight: Model, S40: Motion) -> None:
@@ -120,3 +152,76 @@ def test_hidden_effects_are_told_and_leave_the_mass_right(straight: Model, S40: 
     (coefficient,) = fit.unknown.coefficients(fit.trajectories)[late.every]
     assert coefficient * late.typical == pytest.approx(0.015, abs=0.003)
     assert late.name in {m.name for m in describe_missing(space, fit.unknown, fit.trajectories)}
+
+
+def test_values_are_averaged_over_sizes_as_the_whole_form_says() -> None:
+    """By the evidence, mean and covariance of every size, from dense matrices."""
+    rng, n, count = np.random.default_rng(3), 2, 3
+    A = rng.standard_normal((12, n + count))
+    likelihood, right = A.T @ A, A.T @ (3 * rng.standard_normal(12))
+    size = 0.05
+    prior = np.diag([0.0] * n + [1.0] * count)
+    information = likelihood + prior / size**2
+    group = Group("force", "N", 1.0, (np.arange(count),))
+    constant_errors = np.array([0.3, 0.0])
+    unknown = UnknownForces((Lacking((), (), count, np.zeros(0)),), (group,), np.array([size]), constant_errors)
+    X, scale, spread = np.array([5.0, -1.0]), np.array([2.0, 0.1]), np.array([1.0, 1.7])
+    covariance = np.linalg.inv(information)[:n, :n] * np.outer(scale * spread, scale * spread)
+    free = np.zeros(n, bool)
+    fit = Fit(X, covariance, free, np.zeros(n), (), (), 1.0, "converged", 0.0, (), unknown, information, right)
+    model = SimpleNamespace(scale=scale, positive=free)
+    found = average_over_sizes(cast(StateSpace, SimpleNamespace(model=model, soil=np.zeros((0, n)))), fit)
+
+    means, covariances, evidence, prior_weight = [], [], [], []
+    for log in sizes.LEVELS:
+        own = likelihood + prior * np.exp(-2 * log)
+        means.append(np.linalg.solve(own, right)[:n])
+        covariances.append(np.linalg.inv(own)[:n, :n])
+        evidence.append(right @ np.linalg.solve(own, right) / 2 - np.linalg.slogdet(own)[1] / 2 - count * log)
+        prior_weight.append(np.exp(-((log - np.log(size)) ** 2) / 2 / sizes.AVERAGED_SCATTER**2))
+        evidence[-1] += np.log(prior_weight[-1])
+    weight = np.exp(evidence - np.max(evidence))
+    weight /= weight.sum()
+    mean = weight @ means
+    whole = sum(w * (C + np.outer(m - mean, m - mean)) for w, C, m in zip(weight, covariances, means, strict=True))
+    share = np.average(np.exp(2 * sizes.LEVELS), weights=prior_weight)  # of which no log tells anything
+    moved = mean - np.linalg.solve(information, right)[:n]
+    np.testing.assert_allclose(found.X, X + scale * moved)
+    expected = whole * np.outer(scale * spread, scale * spread) + np.diag(share * constant_errors**2)
+    np.testing.assert_allclose(found.covariance, expected)
+    back = np.diag(np.sign(moved)) / scale  # what falls with every move
+    held = average_over_sizes(cast(StateSpace, SimpleNamespace(model=model, soil=back)), replace(fit, X=np.zeros(n)))
+    np.testing.assert_array_equal(held.X, np.zeros(n))
+
+
+def test_clustered_inflation_equals_refits_without_each_stretch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By fits anew without each stretch of 2 s, of readings whose errors are slow, and of white ones."""
+    rng, rate, N, n, count = np.random.default_rng(5), 10.0, 400, 2, 4
+    A = rng.standard_normal((N, 1, n + count))
+    A[:, 0, 0] = 1.0
+    slow = np.repeat(rng.standard_normal(N // 20), 20)
+    prior = np.eye(n + count) / 9
+    for errors, correlated in ((slow, True), (rng.standard_normal(N), False)):
+        readings = A[:, 0] @ rng.standard_normal(n + count) + errors
+        information = prior + A[:, 0].T @ A[:, 0]
+        best = np.linalg.solve(information, A[:, 0].T @ readings)
+        E = np.concatenate([(A[:, 0] @ best - readings)[:, None, None], A], axis=2)
+        monkeypatch.setattr(sizes, "whiten", lambda log, E=E: SimpleNamespace(E=E))
+        free = np.zeros(n, bool)
+        lacking = UnknownForces((Lacking((), (), count, np.zeros(0)),), (Group("f", "N", 1.0, (np.arange(count),)),))
+        trajectory = cast(Trajectory, SimpleNamespace(offset=np.zeros(0)))
+        log = (cast(LinearisedLog, None),)
+        fit = Fit(
+            best[:n], np.eye(n), free, free, (trajectory,), log, 1.0, "converged", 0.0, (), lacking, information, best
+        )
+        moved = []
+        for begin in range(0, N, 20):
+            kept = np.r_[0:begin, begin + 20 : N]
+            own = prior + A[kept, 0].T @ A[kept, 0]
+            moved.append(np.linalg.solve(own, A[kept, 0].T @ readings[kept]) - best)
+        expected = np.sqrt(np.sum(np.square(moved), axis=0) / np.diag(np.linalg.inv(information)))[:n]
+        found = sizes.clustered_inflation(fit, rate)
+        np.testing.assert_allclose(found, np.maximum(expected, 1.0))
+        assert (found[0] > 3.0) == correlated

@@ -13,9 +13,9 @@ SHARED = Path(__file__).parents[3] / "shared" / "data"
 RESULTS = Path(__file__).parents[2] / "results"
 
 
-def study(name: str) -> ModuleType:
-    """The script of a study in results/, as a module."""
-    spec = importlib.util.spec_from_file_location(f"study_{name}", RESULTS / name / "study.py")
+def study(name: str, script: str = "study") -> ModuleType:
+    """A script of a study in results/, as a module."""
+    spec = importlib.util.spec_from_file_location(f"{script}_{name}", RESULTS / name / f"{script}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)

@@ -81,7 +81,7 @@ def said(err: BaseException) -> str:
 def quiet() -> Iterator[None]:
     """Keep what libraries print, log and warn of from the terminal."""
     before, hook = logging.root.manager.disable, sys.unraisablehook
-    sys.unraisablehook = _ignore
+    sys.unraisablehook = lambda _: None
     logging.disable(logging.CRITICAL)
     try:
         with (
@@ -95,10 +95,6 @@ def quiet() -> Iterator[None]:
     finally:
         logging.disable(before)
         sys.unraisablehook = hook
-
-
-def _ignore(_: object) -> None:
-    """Say nothing of an error in a destructor."""
 
 
 def refuse_huge(path: Path, rows: int, columns: int, unpacked: int | None = None) -> None:
@@ -242,13 +238,20 @@ def name_the_same(names: Sequence[str], where: str) -> list[str]:
     return notes
 
 
-def vectors_apart(table: pd.DataFrame) -> pd.DataFrame:
-    """Put lists of numbers in a cell, such as "[0.1, 0.2]", into columns of their own: name[0], name[1]."""
+def vectors_apart(table: pd.DataFrame, comma: bool = False) -> pd.DataFrame:
+    """Put lists of numbers in a cell, such as "[0.1, 0.2]", into columns of their own: name[0], name[1].
+
+    comma: the table has decimal commas. A comma between two digits is one if something else parts the numbers.
+    """
+    apart = re.compile(r"\d(?:,\s|\s|;)\s*[-+\d]" if comma else r"\d\s+[-+\d]")
     for name in [n for n in table.columns if table[n].dtype.kind in "OTU"]:
         cells = table[name]
         first = next((c for c in cells if isinstance(c, str) and c.strip()), "")
         if not VECTOR.fullmatch(first):
             continue
+        if apart.search(first) and not cells.astype(str).str.contains(r"\d,\d+,\d|\d\.\d").any():
+            cells = cells.str.replace(r"(?<=\d),(?=\d)", ".", regex=True)
+            first = next(c for c in cells if isinstance(c, str) and c.strip())
         wide = len(NUMBERS.findall(first))
         rows = [NUMBERS.findall(c) if isinstance(c, str) and VECTOR.fullmatch(c) else None for c in cells]
         blank = cells.isna() | (cells.astype(str).str.strip() == "")

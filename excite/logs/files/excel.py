@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import itertools
 import zipfile
@@ -16,6 +17,8 @@ from excite.logs.files import common, layout
 
 BEGIN = 200  # rows in which the header is looked for; chosen
 LONGEST = 1_048_576  # rows of a sheet: Excel's own limit
+# Parts that take ten times as long as cells.
+AROUND = (".rels", "workbook.xml", "styles.xml", "Types].xml", "core.xml", "custom.xml")
 UNASKED_BYTES = 20_000_000  # to which a small workbook may unpack, in some ten seconds; chosen
 MOST_TIMES = 60  # its own size to which a larger one may; tables of numbers do to 5 to 30 times; chosen
 BLOCK_CELLS = 500_000  # cells that are read before they become numbers
@@ -27,24 +30,27 @@ def read_excel(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     import openpyxl
 
     with zipfile.ZipFile(path) as packed:
-        unpacked = sum(item.file_size for item in packed.infolist())
-    if unpacked > max(UNASKED_BYTES, min(MOST_TIMES * path.stat().st_size, common.MOST_BYTES)):
-        raise LogError(f"{path}: unpacks to {unpacked // 10**6} MB, more than is read; save it as CSV in shorter logs")
-    book = openpyxl.load_workbook(path, read_only=True, data_only=True)
-    best, most, count = None, -1, len(book.worksheets)
-    try:
-        for sheet in book.worksheets:
-            table = _sheet(path, sheet, unpacked)
-            if table is None:
+        parts, small = packed.infolist(), UNASKED_BYTES // 10
+        unpacked = sum(part.file_size for part in parts)
+        slow = sum(part.file_size for part in parts if part.filename.endswith(AROUND)) > small
+        slow |= any(part.file_size > max(small, MOST_TIMES * part.compress_size) for part in parts)
+        books = [part for part in parts if part.filename.endswith("workbook.xml") and not slow]
+        slow |= any(packed.read(part).count(b"sheetId=") > 500 for part in books)
+    if slow or unpacked > max(UNASKED_BYTES, min(MOST_TIMES * path.stat().st_size, common.MOST_BYTES)):
+        size = f"unpacks to {unpacked // 10**6} MB, most of it repeats, or more than 500 sheets"
+        raise LogError(f"{path}: {size}, more than is read; save it as CSV in shorter logs")
+    best, most = None, -1
+    with contextlib.closing(openpyxl.load_workbook(path, read_only=True, data_only=True, keep_links=False)) as book:
+        sheets = {sheet._worksheet_path: sheet for sheet in book.worksheets}  # some may share a part
+        for sheet in sheets.values():
+            if (table := _sheet(path, sheet, unpacked)) is None:
                 continue
             has = len(wanted & {*map(str, table.columns), *table.attrs[common.OTHER_NAMES]})
             if has > most:
                 best, most = table, has
-                best.attrs[common.NOTES] += [f"read from sheet {sheet.title}"] if count > 1 else []
+                best.attrs[common.NOTES] += [f"read from sheet {sheet.title}"] if len(sheets) > 1 else []
             if has == len(wanted):
                 break
-    finally:
-        book.close()
     if best is None:
         raise LogError(f"{path}: no sheet has a line with the names of columns and numbers below it")
     return best
@@ -117,9 +123,8 @@ def _column(cells: list[Any]) -> pd.Series:
             return pd.Series(cells)
         return pd.Series([np.nan if _blank(cell) else float(cell) for cell in cells], dtype=float)
     if kinds <= {datetime.datetime, datetime.date}:
-        return pd.Series(
-            pd.to_datetime(pd.Series([None if _blank(cell) else cell for cell in cells], dtype=object)).dt.as_unit("ns")
-        )
+        days = pd.Series([None if _blank(cell) else cell for cell in cells], dtype=object)
+        return pd.Series(pd.to_datetime(days).dt.as_unit("ns"))
     if kinds <= {datetime.time, datetime.timedelta, datetime.datetime}:
         since = [None if _blank(cell) else _since_midnight(cell) for cell in cells]
         return pd.Series(pd.to_timedelta(pd.Series(since, dtype=object)).dt.as_unit("ns"))

@@ -15,9 +15,7 @@ BRACKETED = re.compile(r"(.*?\S)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]")  # theta1 [de
 UNIT_LIKE = re.compile(r"[^\W\d_][^\W_]{0,11}([ */^.-][^\W_]{1,6}){0,2}|[%\u2030]")  # no number of an element, no name
 SPELLINGS = {
     "radian": "rad",
-    "radians": "rad",
     "degree": "deg",
-    "degrees": "deg",
     "rad/sec": "rad/s",
     "deg/sec": "deg/s",
     "u/min": "rpm",
@@ -29,16 +27,18 @@ SPELLINGS = {
     "m/sec": "m/s",
     "kph": "km/h",
     "kmh": "km/h",
+    "newton": "N",
     "n m": "N m",
     "kn m": "kN m",
+    "ampere": "A",
+    "amp": "A",
+    "volt": "V",
     "sec": "s",
-    "secs": "s",
     "second": "s",
-    "seconds": "s",
     "msec": "ms",
     "usec": "us",
     "days": "day",
-}  # of units; written without case
+}  # of units; written without case and without the s of a plural
 WORD_LINES = 2  # lines of units and of other names below a header
 LONGEST_UNIT = 12  # characters; what is longer is a name; chosen
 ALIKE = 5  # rows below the first one of data that are looked at as well; chosen
@@ -160,7 +160,8 @@ def known_unit(text: str) -> str:
     if plain in UNITS:
         return plain
     plain = re.sub(r"\s*[\u00b7\u22c5*.\u2219-]\s*", " ", plain).replace("\u03bc", "u").replace("\u00b5", "u")
-    return next((u for u in (plain, SPELLINGS.get(plain.lower(), "")) if u in UNITS), "")
+    words = (plain.lower(), plain.lower().removesuffix("s"))
+    return next((u for u in (plain, *(SPELLINGS.get(word, "") for word in words)) if u in UNITS), "")
 
 
 def bracketed_units(names: Sequence[str]) -> dict[str, str]:

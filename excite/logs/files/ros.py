@@ -13,14 +13,16 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs.files import common
+from excite.logs.formats import BAG_FOLDER
 
 STAMP = "header.stamp"  # time column that stands for the stamp in each message's own header
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 NAMES = ("name", "names", "joint_names", "interface_names")  # fields with the names of an array's elements
 DEEPEST = 8  # messages in messages; chosen
 NANOSECONDS = 1_000_000_000
+FEWEST = 20  # messages from which publishers can be told apart
 
-Message = tuple[str, int, Any]  # topic, time of logging [ns], message
+Message = tuple[str, int, Any, str]  # topic, time of logging [ns], message, who sent it as far as the file says
 
 
 def read_bag(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
@@ -28,7 +30,8 @@ def read_bag(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    bag = path.parent if path.is_file() and path.suffix != ".bag" and _in_bag(path) else path
+    in_bag = path.is_file() and path.suffix != ".bag" and (path.parent / BAG_FOLDER).is_file()
+    bag = path.parent if in_bag else path
     unknown: set[str] = set()
     with AnyReader([bag], default_typestore=get_typestore(Stores.LATEST)) as reader:
         used = _topics({c.topic for c in reader.connections}, wanted)
@@ -40,13 +43,10 @@ def read_bag(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
                 except KeyError:  # a type that neither the bag nor the library defines
                     unknown.add(connection.topic)
                     continue
-                yield connection.topic, at, message
+                sender = getattr(connection.ext, "callerid", None) or f"connection {connection.id}"
+                yield connection.topic, at, message, sender
 
         return _table(path, messages(), wanted, unknown, [])
-
-
-def _in_bag(path: Path) -> bool:
-    return (path.parent / "metadata.yaml").is_file()
 
 
 def read_mcap(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
@@ -79,7 +79,8 @@ def read_mcap(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
                     if decoders[channel.id] is None:
                         unknown.add(channel.topic)
                     else:
-                        yield channel.topic, message.log_time, decoders[channel.id](message.data)
+                        read = decoders[channel.id](message.data)
+                        yield channel.topic, message.log_time, read, f"channel {channel.id}"
             except (McapError, EOFError) as err:
                 if whole:
                     raise
@@ -105,16 +106,18 @@ class _Topic:
     """What the messages of a topic hold: times [ns], a row of numbers each, and which element has which name.
 
     elements: a column named by a joint -> the same one by its place, in the last message; moved: names have changed
-    their places along the log, or share them.
+    their places along the log, or share them. senders: number by sender; sent: that of each message.
     """
 
     def __init__(self, path: Path) -> None:
         self.times, self.rows = array("q"), common.Rows(path)
         self.elements: dict[str, str] = {}
         self.moved = False
+        self.senders, self.sent = dict[str, int](), array("q")
 
-    def add(self, at: int, row: dict[str, float], elements: dict[str, str]) -> None:
+    def add(self, at: int, row: dict[str, float], elements: dict[str, str], sender: str) -> None:
         """Add the numbers of a message."""
+        self.sent.append(self.senders.setdefault(sender, len(self.senders)))
         self.times.append(at)
         self.rows.add(row)
         if elements != self.elements and elements:
@@ -142,20 +145,24 @@ def _table(
     """Make one table of all messages, at the times of logging from the first on, or at those in their headers."""
     topics: dict[str, _Topic] = {}
     first: int | None = None
-    for topic, at, message in messages:
+    for topic, at, message, sender in messages:
         first = at if first is None else first
         row, elements = dict[str, float](), dict[str, str]()
         _collect(topic, message, row, first, 0, (), elements)
         if not row:
             continue
-        topics.setdefault(topic, _Topic(path)).add(at, row, elements)
+        fields = _fields(message)
+        said = (_fields(fields.get("header")).get("frame_id"), " ".join(_names_in(fields)))
+        sender = ", ".join([sender, *(str(s)[: common.WORDS] for s in said if s)])
+        topics.setdefault(topic, _Topic(path)).add(at, row, elements, sender)
     if unknown:
         notes.append(f"messages of an unknown type are left out: {', '.join(sorted(unknown)[:3])}")
     if first is None or not topics:
         raise LogError(f"{path}: no message with numbers{'; ' + notes[-1] if notes else ''}")
-    groups, other = [], dict[str, str]()
+    groups, other, unclear = [], dict[str, str](), dict[str, str]()
     for topic, found in topics.items():
         t: np.ndarray = (np.array(found.times) - first) / NANOSECONDS
+        sent = np.array(found.sent)
         columns = found.columns(topic, notes)
         other |= {} if found.moved else found.elements
         if STAMP in wanted:
@@ -163,9 +170,12 @@ def _table(
             if not np.isfinite(t).all():
                 notes.append(f"{topic}: has no stamp in a header, left out")
                 continue
-            if found.moved:  # publishers whose stamps are not in the order of arrival
+            if found.moved or len(found.senders) > 1:  # publishers whose stamps are not in the order of arrival
                 order = np.argsort(t, kind="stable")
-                t, columns = t[order], {name: values[order] for name, values in columns.items()}
+                t, sent, columns = t[order], sent[order], {name: values[order] for name, values in columns.items()}
+        named = {place: own for own, place in found.elements.items()}
+        bad = {name: named.get(name, name) for name, x in columns.items() if _contradict(x, sent, "/position" in name)}
+        unclear |= dict.fromkeys(bad, _conflict(topic, [*bad.values()], list(found.senders)))
         groups.append((t, columns))
     if not groups:
         raise LogError(f"{path}: no message has a stamp in a header; write another time_column")
@@ -174,8 +184,37 @@ def _table(
     if STAMP in wanted:
         table.insert(0, STAMP, table.iloc[:, 0])
     kept = {name: column for name, column in other.items() if column in table.columns and name not in table.columns}
-    table.attrs |= {common.NOTES: notes, common.OTHER_NAMES: kept}
+    table.attrs |= {common.NOTES: notes, common.OTHER_NAMES: kept, common.UNCLEAR: unclear}
     return table
+
+
+def _contradict(x: np.ndarray, sent: np.ndarray, smooth: bool) -> bool:
+    """Return whether senders of one number contradict each other. x (N,): the number; sent (N,): who sent it.
+
+    Values that jump from one message to the next, and hardly from one to the sender's own next, which comes later,
+    have several sources. Senders that the file does not tell apart are taken to send in turns of two to
+    four, and looked for in what is smooth: a force may vibrate like that.
+    """
+    there = np.isfinite(x)
+    x, sent = x[there], sent[there]
+    switched = sent[1:] != sent[:-1]
+    if len(x) < FEWEST:
+        return False
+    if (every := np.bincount(sent)).size > 1 and switched.sum() >= FEWEST:
+        own = [np.abs(np.diff(x[sent == k])).mean() for k in np.flatnonzero(every > 1)]
+        return bool(own and np.abs(np.diff(x)[switched]).mean() > 1.5 * np.mean(own))
+    turns = min(np.abs(x[n:] - x[:-n]).mean() for n in (2, 3, 4))
+    return smooth and bool(np.abs(np.diff(x)).mean() > 2 * turns)
+
+
+def _conflict(topic: str, columns: list[str], senders: list[str]) -> str:
+    """Say that the senders of a topic contradict each other in these columns, and what to do."""
+    which = ", ".join(c.removeprefix(f"{topic}/") for c in columns[:3]) + ", ..." * (len(columns) > 3)
+    told = f" ({'; '.join(senders[:3])})" if len(senders) > 1 else ""
+    return (
+        f"{topic}: several publishers{told} send {which}, and their values contradict each other; record one of them"
+        f' alone (`ros2 topic info -v {topic}` lists them), or try time_column = "{STAMP}" if one is only late'
+    )
 
 
 def _fields(value: Any) -> dict[str, Any]:
@@ -219,9 +258,14 @@ def _collect(
             since = numbers[0] * NANOSECONDS + numbers[1]
             row[name] = (since - first if since > first // 2 else since) / NANOSECONDS  # a date, or a duration
             return
-        names = next((n for key in NAMES if (n := _names(fields.get(key)))), names)
+        names = _names_in(fields) or names
         for key, one in fields.items():
             _collect(f"{name}/{key}", one, row, first, depth + 1, names, elements)
+
+
+def _names_in(fields: dict[str, Any]) -> tuple[str, ...]:
+    """Return the names of elements that a message gives in one of its fields, () without."""
+    return next((n for key in NAMES if (n := _names(fields.get(key)))), ())
 
 
 def _names(value: Any) -> tuple[str, ...]:

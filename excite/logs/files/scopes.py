@@ -72,7 +72,8 @@ def _labview(path: Path, lines: list[str], notes: list[str]) -> tuple[list[Group
         begin = mark + 1
         head = _settings_above(lines, mark, separator) if len(marks) > 1 else {}
         if begin < len(lines) and not _is_data(lines[begin], separator, comma):
-            names, begin = [cell.strip() for cell in lines[begin].split(separator)], begin + 1
+            first, *rest = (cell.strip() for cell in lines[begin].split(separator))
+            names, begin = [first or X_NAME, *rest], begin + 1  # a file without X columns may leave its place blank
         end = next((k for k in range(begin, len(lines)) if not _is_data(lines[k], separator, comma)), len(lines))
         after = range(end, (*heads, len(lines))[n + 1])
         if any(_is_data(lines[k], separator, comma) for k in after):

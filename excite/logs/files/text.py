@@ -101,7 +101,7 @@ def read_text(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
         if comma:
             table[name], unclear[name] = _without_commas(table[name], comma)
         table[name] = _dates(table[name])
-    table = common.vectors_apart(table)
+    table = common.vectors_apart(table, bool(comma))
     other = layout.without_units(found.names) | found.other
     table.attrs |= {
         common.UNITS_UNKNOWN: layout.unknown_units(found.names),
