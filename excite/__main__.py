@@ -19,8 +19,9 @@ from excite.cli import (  # noqa: E402
     app,
     fail,
 )
-from excite.errors import ExciteError  # noqa: E402
+from excite.errors import ExciteError, StoppedError  # noqa: E402
 
+BESIDE_THE_WORK = str(StoppedError("the machine was being read, or the result written"))
 # Errors of the file system that the user can mend: full disk, quota, too large a file, read-only, no permission.
 USERS_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
 
@@ -40,7 +41,7 @@ def main() -> None:
         except typer.TyperException as err:
             fail(" ".join(err.format_message().split()), 2)
         except (KeyboardInterrupt, typer.Abort):
-            fail("interrupted, nothing was written", INTERRUPTED)
+            fail(BESIDE_THE_WORK, INTERRUPTED)
         except Exception as err:
             if isinstance(err, OSError) and err.errno == errno.ENAMETOOLONG:
                 fail(f"{str(err.filename)[:40]}...: is too long a name for a file", 2)
@@ -51,9 +52,9 @@ def main() -> None:
                 fail(" ".join(said_of.split()), code)
             if not said.stop:
                 raise
-            fail("interrupted, nothing was written", INTERRUPTED)
+            fail(BESIDE_THE_WORK, INTERRUPTED)
     if result == INTERRUPTED:  # typer makes an exit code of Ctrl-C
-        fail("interrupted, nothing was written", INTERRUPTED)
+        fail(BESIDE_THE_WORK, INTERRUPTED)
     sys.exit(result if isinstance(result, int) else 0)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from excite import logs as readers, simulation
-from excite.errors import ExciteError
+from excite.errors import ExciteError, UsageError
 from excite.logs import Log, PlannedDrive
 from excite.model import Model
 from excite.model.machine import shipped_machines
@@ -31,14 +31,21 @@ R = TypeVar("R")
 
 CODE = re.compile(r"(`[^`]*`)")  # commands in messages, which keep their options
 VALUED = re.compile(r"(?<![\w-])--([a-z][a-z-]*) (?=[A-Z]{2})")  # an option followed by what it takes
+LEAST = {"runs": 1, "samples": 1, "starts": 1, "seed": 0}  # least value of arguments that are whole numbers
 OPTION = re.compile(r"(?<![\w-])--([a-z][a-z-]*)")
 
 
 def recorded(function: Callable[P, R]) -> Callable[P, R]:
-    """Return the function with results that know their call, and errors that name arguments instead of options."""
+    """Return the function with results that know their call, and errors that name arguments instead of options.
+
+    It raises UsageError for a count that is none, by `LEAST`.
+    """
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        for name, value in inspect.signature(function).bind(*args, **kwargs).arguments.items():
+            if name in LEAST and not (isinstance(value, int | np.integer) and value >= LEAST[name]):
+                raise UsageError(f"{name}: must be a whole number of at least {LEAST[name]} (got {value})")
         try:
             result = function(*args, **kwargs)
         except ExciteError as err:
@@ -118,6 +125,9 @@ def planned_drive(model: Model, drive: Drive, any_rate: bool = False) -> Planned
     any_rate: as for `excite.logs.read_drive`.
     """
     if isinstance(drive, np.ndarray):
+        if drive.ndim != 2 or len(drive) < 2 or drive.shape[1] != len(model.inputs):
+            wanted = f"(N >= 2, {len(model.inputs)}) for {', '.join(model.inputs)}"
+            raise UsageError(f"drive: torques need shape {wanted} (got {drive.shape})")
         rest = np.zeros(len(model.coordinates))
         return PlannedDrive(drive, rest, rest, placed=False)
     if isinstance(drive, Design):

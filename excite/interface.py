@@ -25,7 +25,6 @@ from excite import (
     model as models,
     reports,
     simulation,
-    trajectories,
     workflows,
 )
 from excite.calls import (
@@ -295,10 +294,7 @@ def simulate(
 
 @recorded
 def identify(
-    machine: Machine,
-    logs: Source | Sequence[Source],
-    method: str | None = None,
-    unloaded: Estimate | None = None,
+    machine: Machine, logs: Source | Sequence[Source], method: str | None = None, unloaded: Estimate | None = None
 ) -> ShownEstimate:
     """Estimate the parameters of a machine, with uncertainty, from one log or several.
 
@@ -437,13 +433,7 @@ def slip(
 
 @recorded
 def verify(
-    machine: Machine,
-    drive: Drive,
-    *,
-    runs: int = 50,
-    method: str | None = None,
-    kit: str = "full",
-    seed: int = 0,
+    machine: Machine, drive: Drive, *, runs: int = 50, method: str | None = None, kit: str = "full", seed: int = 0
 ) -> ShownVerification:
     """Simulate a drive with sensor flaws and identify from it, many times.
 
@@ -511,15 +501,10 @@ def score(
         True
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
-    model, zeros = workflows.without_hidden_zeros(model)
-    name, chosen = workflows.choose_problem(model.machine, problem, duration)
-    workflows.require_noise_figures(model)
     given = planned_drive(model, drive, any_rate=True)
-    found = trajectories.score(model, chosen, given.torque, given.start, given.nu0, given.planned)
-    workflows.require_known("kit", kit, simulation.KITS)
-    called = name_of(drive, "the drive")
-    valued = kit if sensors else None
-    return ShownScore.of(found, partial(workflows.score_account, model, name, chosen, found, called, valued, zeros))
+    return ShownScore.of(
+        *workflows.score_from(model, given, name_of(drive, "the drive"), problem, sensors, kit, duration)
+    )
 
 
 @recorded
@@ -555,14 +540,8 @@ def compare(
         True
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
-    name, chosen = workflows.choose_problem(model.machine, problem, None)
-    model, zeros = workflows.without_hidden_zeros(model)
-    workflows.require_noise_figures(model)
     rivals = [str(one) if isinstance(one, str | Path) else planned_drive(model, one, any_rate=True) for one in against]
-    usual, own = workflows.read_rivals("against", rivals, model, chosen)
-    found = trajectories.compare(model, chosen, samples, seed, budget, None, usual, own)
-    account = partial(workflows.compare_account, model, name, found, samples, seed, budget, zeros)
-    return ShownComparison.of(found, account)
+    return ShownComparison.of(*workflows.compare_from(model, problem, samples, rivals, seed, budget))
 
 
 def _log_account(model: Model, source: Source) -> Account:

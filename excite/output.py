@@ -32,7 +32,7 @@ REQUEST_KEYS = ("objective", "duration_s", "method", "runs", "samples", "starts"
 # names of the files that the program writes into a result folder
 OWN_NAMES = re.compile(
     r"summary\.json|machine\.(json|toml)|contact\.toml|(profile|phases|covariance|tolerances|prediction|wiring|log_template)\.csv|README\.md"
-    r"|motion\.(csv|yaml|script|src|mod)|bag|[a-z0-9-]+\.(png|svg|pdf|html|md)|design|verify|next|drives|runs\.parquet|study\.json|machines"
+    r"|motion\.(csv|yaml|script|src|mod)|bag|[a-z0-9-]+\.(png|svg|pdf|html|md)|design|accurate|verify|next|drives|runs\.parquet|study\.json|machines"
 )
 
 
@@ -204,8 +204,7 @@ def _disk(out: Path) -> Iterator[None]:
             raise
         part = f" ({Path(os.fsdecode(err.filename)).name})" if err.filename else ""
         raise DiskError(
-            f"{out}: could not be written{part}: {os.strerror(err.errno)}; nothing is left of it, free some space or"
-            " choose another --out"
+            f"{out}: could not be written{part}: {os.strerror(err.errno)}; free some space, or write to another disk"
         ) from None
 
 

@@ -16,6 +16,7 @@ import pytest
 
 from excite import output
 from excite.errors import DiskError, FolderError
+from excite.workflows import design_request
 
 
 def test_a_folder_appears_whole(tmp_path: Path) -> None:
@@ -114,6 +115,7 @@ def test_json_is_strict() -> None:
 def test_a_folder_of_the_program_s_own_files_is_written_anew(tmp_path: Path) -> None:
     for name in (output.SUMMARY, "tolerances.csv", "covariance.csv", "machine.json", "budget.png", "report.html"):
         (tmp_path / name).write_text("{}")
+    (tmp_path / design_request.OTHER_END).mkdir()
     output.check_out_folder(tmp_path)
 
 

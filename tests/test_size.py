@@ -11,11 +11,11 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "lines": 58_740,
-    "named constants": 825,
-    "files over 600 lines": 2,
-    "functions over 80 lines": 6,
-    "functions with more than 8 parameters": 19,
+    "lines": 58_490,
+    "named constants": 815,
+    "files over 600 lines": 0,
+    "functions over 80 lines": 4,
+    "functions with more than 8 parameters": 15,
     "functions of complexity over 25": 27,
     "circles of imports": 0,
 }

@@ -14,6 +14,7 @@ from excite.app.results import Result, is_readable_file, read_result, read_store
 from excite.errors import MachineError
 from excite.logs import SUFFIXES
 from excite.model.machine import MACHINES, Machine, is_machine_file, load_machine, machine_files, shipped_machines
+from excite.text import format_number
 
 MOST_PASSED_OVER = 20  # lines about what no step can show
 STATE = "app.json"  # choices of the day that no result holds
@@ -246,6 +247,16 @@ class Day:
     def designs(self) -> list[Result]:
         """Return the designs of the chosen machine, the newest first."""
         return [r for r in self.results("design") if self._is_machine(r.summary["machine"])]
+
+    def design_names(self) -> dict[str, str]:
+        """Return the designs of the chosen machine by folder, each with its worst parameter and cond(Phi)."""
+        names = {}
+        for r in self.designs():
+            worst, cond = r.summary["worst_percent"], r.summary.get("cond_phi")
+            known = worst is not None and isinstance(cond, int | float)
+            said = f": worst {format_number(worst, 3)} % at cond(Phi) {format_number(cond, 4)}" if known else ""
+            names[str(r.folder)] = f"{r.folder.relative_to(self.folder)}{said}"
+        return names
 
     def design(self) -> Result | None:
         """Return the design to drive: the chosen one, or the newest."""

@@ -95,14 +95,14 @@ def design(day: Day, page: Page) -> None:
 def drive(day: Day, page: Page) -> None:
     """Fields of the driver's aids."""
     with row():
-        _choose_design(day)
+        choose_design(day)
         number(day, "drive", "phases", "empty: as many as it takes")
         number(day, "drive", "shortest", "empty: 2 s")
 
 
-def _choose_design(day: Day) -> None:
-    names = {str(r.folder): r.folder.name for r in day.designs()}
-    if names:
+def choose_design(day: Day) -> None:
+    """Choose the design to drive, once there is one."""
+    if names := day.design_names():
         chosen = day.design()
         day.forms["drive"]["design"] = str(chosen.folder) if chosen else None
         choice(day.forms["drive"], "design", "Design", names, "the newest unless you choose another")
@@ -229,7 +229,7 @@ def diagnose(day: Day, page: Page) -> None:
 
 def compare(day: Day, page: Page) -> None:
     """Choose two designs."""
-    form, names = day.forms["compare"], {str(r.folder): r.folder.name for r in day.designs()}
+    form, names = day.forms["compare"], day.design_names()
     if len(names) < 2:
         return
     first, second, *_ = names

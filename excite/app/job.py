@@ -66,6 +66,14 @@ class Job:
         """Return the time since it began, or that it took [s]."""
         return time.monotonic() - self.begin if self.running else self.seconds
 
+    @property
+    def time_left(self) -> str:
+        """Return in words how much of a --budget is left, "" without one."""
+        if "--budget" not in self.arguments:
+            return ""
+        left = float(self.arguments[self.arguments.index("--budget") + 1]) - self.elapsed_s
+        return f", {left:.0f} s left to search" if left > 0 else ", about to end"
+
     def stop(self) -> None:
         """Ask the command to stop, as Ctrl-C does: what it has so far it may keep. The second time, end it."""
         self.stops += 1

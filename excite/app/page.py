@@ -183,7 +183,7 @@ class Window:
         if job.running:
             best = "" if job.best is None else f", best so far: {_score(job)}"
             self.doing.text = f"{what}: {'stopping' if job.stops else job.doing or job.label}"
-            self.numbers.text = f"{job.elapsed_s:.0f} s{best}"
+            self.numbers.text = f"{job.elapsed_s:.0f} s{job.time_left}{best}"
             self.progress.props(f"{'indeterminate' if not job.total else ':indeterminate=false'}")
             self.progress.value = job.done / job.total if job.total else 0.0
             self.course.content = draw_course(job.course, job.elapsed_s)
@@ -194,7 +194,8 @@ class Window:
         elif job.message:
             said = f"{what}: {job.message}"
         else:
-            said = f"{what}: ended after {job.elapsed_s:.0f} s."
+            kept = "stopped, and what it had found is kept," if job.stops else "ended"
+            said = f"{what}: {kept} after {job.elapsed_s:.0f} s."
         failed = bool(said) and not job.running and bool(job.message)
         look = "error" if failed else "unseen" if job.running else ""
         self.said.classes(replace=f"said {look}").props(f"role={'alert' if failed else 'status'}")
@@ -275,6 +276,9 @@ class Window:
         if self.step == COMPARE:
             self._comparison(results)
             return
+        if self.step == "design" and len(self.day.designs()) > 1:
+            with fields.row():
+                fields.choose_design(self.day)
         for result in results:
             said = reports.describe(result.kind, result.summary)
             status = "invalid" if result.summary.get("faults") else said.status
@@ -328,10 +332,10 @@ class Window:
             ui.label("Needs two designs of this machine: step Design makes another, under a name of its own.")
             return
         one, other = (r.summary for r in results)
-        names = [r.folder.name for r in results]
-        best, worse = sorted(results, key=lambda r: r.summary["worst_percent"])
-        reach = [f"{format_number(r.summary['worst_percent'], 3)} %" for r in (best, worse)]
-        words = f"{best.folder.name} is the more accurate one: every parameter to {reach[0]} or better, the other to "
+        names = [str(r.folder.relative_to(self.day.folder)) for r in results]
+        ordered = sorted((r.summary["worst_percent"], name) for r, name in zip(results, names, strict=True))
+        reach = [f"{format_number(value, 3)} %" for value, _ in ordered]
+        words = f"{ordered[0][1]} is the more accurate one: every parameter to {reach[0]} or better, the other to "
         words = f"{words}{reach[1]}." if reach[0] != reach[1] else f"Both give every parameter to {reach[0]} or better."
         ui.html(
             reports.result_fragment(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import mimetypes
 import os
 import secrets
 import socket
@@ -12,18 +13,21 @@ import sys
 import tempfile
 import threading
 import webbrowser
-from collections.abc import Awaitable, Callable, MutableMapping
+from collections.abc import Awaitable, Callable, Iterator, MutableMapping
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from urllib.parse import quote
 
 from excite import output
 from excite.app.day import Day
 from excite.app.results import is_possible_name
-from excite.errors import FolderError, ServeError, UsageError
+from excite.errors import DiskError, FolderError, ServeError, UsageError
 from excite.logs import ENDINGS, SUFFIXES
 
 HOST = "127.0.0.1"
+PIECE = 1 << 18  # bytes of a file that are sent at once
 TOKEN_BYTES = 24  # random bytes in the address; chosen
 MAX_LOG_BYTES = 2 * 10**9  # of a log that the browser hands over; chosen
 STOP_S = 20.0  # that a running command gets to keep its best when the window ends [s]; chosen
@@ -90,10 +94,16 @@ async def _refuse(scope: Scope, receive: Receive, send: Send) -> None:
     await send({"type": "http.response.body", "body": body})
 
 
+def _pieces(opened: BinaryIO) -> Iterator[bytes]:
+    """Yield a file piece by piece, as far as it is there: it may be replaced or cut off meanwhile."""
+    with opened, suppress(OSError):
+        yield from iter(partial(opened.read, PIECE), b"")
+
+
 def web_app(day: Day) -> Any:
     """Return the web application of a day: the page, files of results, and a way to hand over a log."""
     from fastapi import FastAPI
-    from fastapi.responses import FileResponse, PlainTextResponse
+    from fastapi.responses import PlainTextResponse, StreamingResponse
     from nicegui import ui
     from starlette.requests import ClientDisconnect
 
@@ -106,12 +116,14 @@ def web_app(day: Day) -> Any:
         try:
             found = output.real(day.folder / path)
             there = found.is_relative_to(output.real(day.folder)) and found.is_file()
+            opened = found.open("rb") if there else None
         except (OSError, ValueError):  # a name that no file can have
-            there = False
-        if not there:
+            opened = None
+        if opened is None:
             return PlainTextResponse("no such file\n", 404)
         policy = {} if found.suffix == ".pdf" else {"Content-Security-Policy": FILE_POLICY}  # a viewer needs no sandbox
-        return FileResponse(found, headers={"Cache-Control": "no-cache", **policy})
+        kind = mimetypes.guess_type(found.name)[0] or "application/octet-stream"
+        return StreamingResponse(_pieces(opened), headers={"Cache-Control": "no-cache", **policy}, media_type=kind)
 
     async def log(request: Any) -> Any:
         name = Path(request.path_params["name"].replace("\\", "/")).name
@@ -135,12 +147,12 @@ def web_app(day: Day) -> Any:
             return PlainTextResponse(taken, 409)
         except ClientDisconnect:
             return PlainTextResponse(f"{name}: came in part only", 400)
-        except (UsageError, FolderError, OSError) as err:
+        except (UsageError, FolderError, DiskError, OSError) as err:
             return PlainTextResponse(f"{name}: {err}" if isinstance(err, OSError) else str(err), 400)
         day.logs = [str(path)]
         try:
             day.save()
-        except (FolderError, OSError) as err:
+        except (FolderError, DiskError, OSError) as err:
             return PlainTextResponse(f"{path} is there, but the choices of the day can't be stored: {err}", 400)
         return PlainTextResponse(str(path))
 

@@ -11,11 +11,7 @@ import typer
 
 from excite.cli import terminal
 
-app = typer.Typer(
-    name="excite",
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-)
+app = typer.Typer(name="excite", rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
 def _version(wanted: bool) -> None:

@@ -127,16 +127,15 @@ def design(
         objective = "discrimination"
     if phase_min != 3.0 and not driver:
         raise UsageError("--phase-min needs --driver as well")
-    earlier, pair = tuple(after or ()), tuple(between or ())
     request = DesignRequest(
         objective,
         sigma_max,
         robust,
-        earlier,
+        tuple(after or ()),
         starts,
         seed,
         budget,
-        pair,
+        tuple(between or ()),
         driver,
         phase_min,
         cond_slack,

@@ -90,7 +90,8 @@ def effects_page() -> str:
     ]
     for e in catalogue:
         sites = effects.allowed_places(va12, e)
-        typical = [f"`{e.name}@{where}={_typical(va12, e, bodies):.3g}`" for where, (bodies, _) in sites.items()]
+        sizes = {where: e.typical_magnitude(Site.of(va12, bodies)) for where, (bodies, _) in sites.items()}
+        typical = [f"`{e.name}@{where}={size:.3g}`" for where, size in sizes.items()]
         lines += [f"## {e.name}", "", f"{_sentence(e.meaning)} {_magnitude(e)}", ""]
         lines += [f"Seen in a log: {e.signature.strip('.')}.", "", f"Source: {e.source.strip('.')}.", ""]
         if typical:
@@ -108,10 +109,6 @@ def effects_page() -> str:
                 else []
             )
     return _page(*lines)
-
-
-def _typical(machine: Machine, e: Effect, bodies: tuple[int, ...]) -> float:
-    return e.typical_magnitude(Site.of(machine, bodies))
 
 
 def _magnitude(e: Effect) -> str:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from excite import reports, workflows
+from excite.errors import StoppedError
 from excite.text import format_number
 
 LINE_INTERVAL_S = 30.0  # between lines of progress where there is no terminal; chosen
@@ -65,9 +66,6 @@ def fail(message: str, code: int) -> NoReturn:
     sys.exit(code)
 
 
-Advance = Callable[[int, int, float | str | None], None]  # done, total, best score so far or what is being done
-
-
 _announced: ContextVar[str | None] = ContextVar("announced", default=None)  # said when the work begins
 
 
@@ -93,21 +91,41 @@ def _say_announced() -> None:
 
 
 @contextmanager
-def bar(label: str) -> Iterator[Advance]:
-    """Show a progress bar on stderr; lines of JSON if `PROGRESS_VARIABLE` asks for them, nothing without a terminal."""
+def bar(label: str) -> Iterator[workflows.Advance]:
+    """Show a progress bar on stderr; lines of JSON if `PROGRESS_VARIABLE` asks for them, nothing without a terminal.
+
+    Raises StoppedError on Ctrl-C: why there is no result, or how far the work was.
+    """
     _say_announced()
-    if os.environ.get(workflows.PROGRESS_VARIABLE) == "json":
+    reached = "had only begun"
+    with (_json_lines if os.environ.get(workflows.PROGRESS_VARIABLE) == "json" else _drawn_bar)(label) as tell:
 
-        def write(done: int, total: int, note: float | str | None) -> None:
-            best = note if note is not None and not isinstance(note, str) and math.isfinite(note) else None
-            doing = note if isinstance(note, str) else getattr(note, "doing", None)
-            said = {"label": label, "done": done, "total": total, "best": best, "doing": doing}
-            sys.stderr.write(f"{json.dumps(said)}\n")
-            sys.stderr.flush()
+        def advance(done: int, total: int, note: float | str | None) -> None:
+            nonlocal reached
+            reached = f"was at step {done} of {total}"
+            tell(done, total, note)
 
-        write(0, 0, None)
-        yield write
-        return
+        try:
+            yield advance
+        except KeyboardInterrupt as stopped:
+            raise StoppedError(str(stopped) or f"{label} {reached}") from None
+
+
+@contextmanager
+def _json_lines(label: str) -> Iterator[workflows.Advance]:
+    def write(done: int, total: int, note: float | str | None) -> None:
+        best = note if note is not None and not isinstance(note, str) and math.isfinite(note) else None
+        doing = note if isinstance(note, str) else getattr(note, "doing", None)
+        said = {"label": label, "done": done, "total": total, "best": best, "doing": doing}
+        sys.stderr.write(f"{json.dumps(said)}\n")
+        sys.stderr.flush()
+
+    write(0, 0, None)
+    yield write
+
+
+@contextmanager
+def _drawn_bar(label: str) -> Iterator[workflows.Advance]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 

@@ -51,8 +51,6 @@ START_AMPLITUDES = (1.0, 0.85, 0.7)  # of the smoothed design's speeds and angle
 SAFE_AMPLITUDES = (1.0, 0.95, 0.9, 0.8)  # of the result's, to try until people keep every limit; chosen
 VALVE_LIMITS = ("torque", "torque_rate")  # limits that the machine's valves keep, whoever drives
 
-Report = Callable[[int, int, float], None]
-
 
 @dataclass(frozen=True)
 class PhasedDrive:
@@ -85,7 +83,7 @@ def design_phases(
     shortest: float = 3.0,
     seed: int = 0,
     stop: Callable[[], bool] = lambda: False,
-    progress: Report | None = None,
+    progress: trajectories.Report | None = None,
 ) -> PhasedDrive:
     """Design phases for people from a design for torques.
 
@@ -114,7 +112,8 @@ def design_phases(
         reach, whole = 1.0, True
         for k in range(ROUNDS + LEVELS + POLISHES):
             if progress is not None:
-                progress(k + 1, total, merit(search, best, room))
+                doing = f"phases for people, round {k + 1} of {total - 1}"
+                progress(k + 1, total, trajectories.BestSoFar(np.inf, doing))
             if stop():
                 whole = False
                 break
@@ -130,8 +129,6 @@ def design_phases(
                 sharp = SHARPNESS[0] * (SHARPNESS[1] / SHARPNESS[0]) ** (min(k, ROUNDS - 1) / (ROUNDS - 1))
                 best, reach = improve_by_program(search, best, room, reach, sharp, k < ROUNDS, run)
     way = reduce_levels(search, snap_times(search, best.trace), seed)
-    if progress is not None:
-        progress(total, total, merit(search, best, room))
     return _rate_way(replace(search, aim=aim), way, begin, designed, seed, whole)
 
 

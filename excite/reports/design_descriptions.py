@@ -49,19 +49,15 @@ def describe_design(s: Summary) -> Description:
         f"Condition number of Phi {format_number(s['cond_phi'], 4)}, of W {format_number(s['cond_w'], 4)}; best start"
         f" {format_number(s['cond_phi_start'], 4)}."
     ]
-    lowest = s.get("lowest_cond")
-    if lowest:
-        remarks.append(
-            f"The lowest cond(Phi) found is {format_number(lowest['cond_phi'], 4)}, with {lowest['worst_parameter']}"
-            f" to {format_percent(lowest['worst_percent'])}; this {word} is the most accurate one within"
-            f" {format_percent(s['cond_slack_percent'], 3)} of it (`--cond-slack 0` gives the other)."
-        )
     other = s.get("most_accurate")
     if other:
         remarks.append(
-            f"The other end, `--objective accuracy`: {other['worst_parameter']} to"
-            f" {format_percent(other['worst_percent'])} or better at cond(Phi) {format_number(other['cond_phi'], 4)}."
+            f"The other end, `--objective accuracy` from this {word}: {other['worst_parameter']} to"
+            f" {format_percent(other['worst_percent'])} or better at cond(Phi) {format_number(other['cond_phi'], 4)};"
+            f" the folder {other.get('folder', 'of that command')} has it to drive."
         )
+    elif s["objective"] == "cond":
+        remarks.append("The other end, the drive of `--objective accuracy`, was not looked for.")
     if s.get("bound"):
         b = s["bound"]
         what = "the worst parameter" if b["of"] == "worst" else "worst and mean parameter (geometric mean)"
@@ -115,7 +111,8 @@ def describe_design(s: Summary) -> Description:
 def _ends_table(s: Summary) -> list[Table]:
     """Table of the drives between lowest cond(Phi) and highest accuracy, to choose from; none without others."""
     word = "motion" if s.get("trajectory") else "drive"
-    ends = {"lowest cond(Phi), --cond-slack 0": s.get("lowest_cond"), f"this {word}": s}
+    near = f", the most accurate within {format_percent(s['cond_slack_percent'], 3)}" if s.get("lowest_cond") else ""
+    ends = {"lowest cond(Phi), --cond-slack 0": s.get("lowest_cond"), f"this {word}{near}": s}
     ends["for accuracy, --objective accuracy"] = s.get("most_accurate")
     rows = tuple(
         (

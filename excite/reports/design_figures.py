@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 from scipy.signal import find_peaks
@@ -46,7 +47,7 @@ LABEL_ROOM = 2.5  # factor on a logarithmic axis that leaves room for the value 
 MAX_DECADE_TICKS = 7  # of a logarithmic axis; chosen
 MIN_SWING_PERCENT = 4.0  # of a torque's limit that is seen as a swing; chosen
 PATH_FLATNESS = 0.3  # least ratio of height to width, or of width to height, of the ground in sight; chosen
-EXCERPT_SWINGS = 12  # in an excerpt; chosen
+EXCERPT_SWINGS = 6  # in an excerpt; chosen
 EXCERPTS_IN_DRIVE = 12  # excerpts of such swings in a drive, from which it needs one; chosen
 
 
@@ -122,10 +123,12 @@ def _time_panels(model: Model, motion: Motion) -> list[TimePanel]:
         rim = float(b.contact.radius) * machine.joint_values(b, motion.nu.T)
         speeds[f"rim of {b.name.replace('_', ' ')}"] = rim
     if not speeds:
-        speeds = {c: motion.nu[:, k] for k, c in enumerate(model.coordinates)}
+        called = {b.coordinates[0]: b.where.replace("_", " ") for b in machine.actuated}
+        speeds = {called.get(c, c): motion.nu[:, k] for k, c in enumerate(model.coordinates)}
+    rates = {"m/s"} if machine.planar else {"rad/s" if b.joint == "revolute" else "m/s" for b in machine.actuated}
     rims = [float(b.limit.rim_speed) for b in machine.contacts if b.limit.rim_speed is not None]
     fastest = (-max(rims), max(rims)) if rims else ()
-    panels.append(TimePanel("speed [m/s]" if machine.planar else "speed\n[m/s or rad/s]", t, speeds, fastest))
+    panels.append(TimePanel(f"speed [{' or '.join(sorted(rates))}]", t, speeds, fastest))
     moving = [b for b in machine.actuated if b.limit.position_range is not None]
     if moving:
         angles = {b.where.replace("_", " "): motion.q[:, model.coordinates.index(b.coordinates[0])] for b in moving}
@@ -145,14 +148,15 @@ def _time_panels(model: Model, motion: Motion) -> list[TimePanel]:
 
 
 def _fast_part(t: np.ndarray, curves: Sequence[np.ndarray]) -> slice | None:
-    """Return the part of a drive in which curves [%] swing too fast to be seen as a whole; None without one."""
-    densest: tuple[float, slice] | None = None
+    """Return the part of a drive in which curves [%] swing too fast to be seen, and most; None without one."""
+    found: list[tuple[float, slice]] = []
     for y in curves:
-        peaks = find_peaks(y, prominence=MIN_SWING_PERCENT)[0]
-        for first, last in zip(peaks, peaks[EXCERPT_SWINGS:], strict=False):
-            if densest is None or t[last] - t[first] < densest[0]:
-                densest = (float(t[last] - t[first]), slice(int(first), int(last) + 1))
-    return densest[1] if densest and densest[0] < (t[-1] - t[0]) / EXCERPTS_IN_DRIVE else None
+        peaks, of = find_peaks(y, prominence=MIN_SWING_PERCENT)
+        for k, (first, last) in enumerate(zip(peaks, peaks[EXCERPT_SWINGS:], strict=False)):
+            if t[last] - t[first] < (t[-1] - t[0]) / EXCERPTS_IN_DRIVE:
+                size = float(of["prominences"][k : k + EXCERPT_SWINGS + 1].sum())
+                found.append((size, slice(int(first), int(last) + 1)))
+    return max(found, key=lambda one: one[0], default=(0.0, None))[1]
 
 
 def _draw_panels(axes: Sequence[Axes], panels: Sequence[TimePanel], room: float) -> None:
@@ -245,6 +249,13 @@ def _logarithmic(ax: Axes, low: float, high: float) -> None:
     ax.grid(axis="x", alpha=0.3)
 
 
+def _plain_numbers(axis: Axis) -> None:
+    """Label decades of a logarithmic axis, and twice and five times as much, with plain numbers."""
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_locator(LogLocator(subs=(2, 5)))
+    axis.set_minor_formatter(lambda x, place: format_number(x, 2))
+
+
 def sensors_figure(values: Sequence[SensorValue], title: str) -> Figure:
     """Plot the accuracy of the worst and the median parameter [%] after each change of the sensors."""
     now, *changes = values
@@ -257,9 +268,7 @@ def sensors_figure(values: Sequence[SensorValue], title: str) -> Figure:
         ax.axvline(getattr(now, key), color=COLOURS[k], linewidth=1, label=f"{label} without a change")
         ax.plot([getattr(v, key) for v in changes][::-1], names, mark, color=COLOURS[k], label=f"{label} parameter")
     ax.set_xscale("log")
-    ax.xaxis.set_major_formatter("{x:g}")
-    ax.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
-    ax.xaxis.set_minor_formatter(lambda x, place: format_number(x, 2))
+    _plain_numbers(ax.xaxis)
     ax.tick_params(axis="both", which="both", labelsize=8)
     ax.set_xlabel(ATTAINABLE, fontsize=8)
     ax.grid(axis="x", which="both", alpha=0.3)
@@ -294,11 +303,8 @@ def draw_campaign(ax: Axes, summary: Mapping[str, Any]) -> None:
     ax.plot(summary["total_s"] / 60, summary["attained_percent"], "kD", fillstyle="none", markersize=9, label="answer")
     ax.set_xscale("log")
     ax.set_yscale("log")
-    for axis in (ax.xaxis, ax.yaxis):
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter(lambda x, place: format_number(x, 2))
-    for axis in (ax.xaxis, ax.yaxis):
-        axis.set_minor_locator(LogLocator(subs=(2, 5)))
+    _plain_numbers(ax.xaxis)
+    _plain_numbers(ax.yaxis)
     ax.tick_params(which="minor", labelsize=8)
     ax.set_xlabel("driving [min]")
     ax.set_ylabel(f"{'worst parameter' if summary['objective'] == 'worst' else summary['objective']} [%]")

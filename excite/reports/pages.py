@@ -81,7 +81,7 @@ FIT_CAPTION = (
 )
 
 
-def write_page(
+def write_report(
     place: Path,
     kind: str,
     summary: Summary,
@@ -89,7 +89,7 @@ def write_page(
     explorable: Mapping[str, Explorable] | None = None,
     scene: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write report.html of a folder from its summary and figures. Raises KeyError for an unknown kind.
+    """Write report.html of a folder from its summary and figures, and summary.json. Raises KeyError for another kind.
 
     command: how it was made, the command line by default. explorable: what of each figure a chart shows.
     scene: an arm's motion to look at (`motion_scene`), also written as a page of its own.
@@ -110,6 +110,7 @@ def write_page(
     if scene is not None:
         write_motion_page(scene, place)
     (place / REPORT).write_text(text, encoding="utf-8")
+    output.write_summary(place, summary, command)
 
 
 def folder_pictures(place: Path, summary: Summary, explorable: Mapping[str, Explorable] | None = None) -> list[Picture]:
@@ -130,19 +131,6 @@ def folder_pictures(place: Path, summary: Summary, explorable: Mapping[str, Expl
     return sorted(
         pictures, key=lambda p: (bool(p.folded), order.index(p.path.name) if p.path.name in order else len(order))
     )
-
-
-def write_report(
-    place: Path,
-    kind: str,
-    summary: Summary,
-    command: str | None = None,
-    explorable: Mapping[str, Explorable] | None = None,
-    scene: Mapping[str, Any] | None = None,
-) -> None:
-    """Write report.html and summary.json of a folder, after its figures; options as in `write_page`."""
-    write_page(place, kind, summary, command, explorable, scene)
-    output.write_summary(place, summary, command)
 
 
 def provenance(summary: Summary, command: str | None = None) -> dict[str, str]:

@@ -8,8 +8,7 @@
 - `compare` sets a design against the usual drives in BASELINES: multisines, Fourier series, a hand-made drive.
 - `score` judges any drive as a design is (`Score`): condition numbers, attainable accuracy, excess over every limit.
 - `read_design` reads the folder of a design back (`SavedDesign`).
-- The module `bound` computes how low cond(Phi) can be at best; `bound_accuracy` bounds the accuracy of every drive of a
-  machine with one driven joint.
+- `bound_accuracy` bounds the accuracy of every drive of a machine with one driven joint.
 - `design_joint_motion` designs arms under gravity, as motions of their joints (`TRAJECTORIES`).
 
 A design is a direct collocation (`collocation`), solved by an interior-point method (`interior_point`) in stages from a

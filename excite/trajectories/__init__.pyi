@@ -73,6 +73,7 @@ from .limits import (
 from .multistart import (
     BestSoFar as BestSoFar,
     Design as Design,
+    Report as Report,
     design as design,
     process_count as process_count,
 )

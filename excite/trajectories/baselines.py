@@ -18,7 +18,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from types import MappingProxyType
 
 import casadi as ca
@@ -475,7 +474,7 @@ def compare(
     best = ScoredDrive(
         designed.manoeuvre, designed.motion.q[0], 2 * float(np.log(designed.cond_phi)), designed.violations
     )
-    rows = [_row(model, problem, DESIGNED, best, 1, 1, wall, wall)]
+    rows = [_judged_row(DESIGNED, best.manoeuvre, _judge(model, problem, best), 1, 1, wall, wall)]
     rows += [_own_row(name, found) for name, found in own.items()]
     lowest = designed.cond_phi
     if progress is not None:
@@ -536,37 +535,18 @@ def _rows(
     model: Model, problem: Problem, name: str, samples: Sequence[_BaselineDrive], designed: float
 ) -> list[ComparisonRow]:
     """Return the row of a kind, or the best and the median of a random kind."""
-    ranked = sorted(samples, key=_drive_rank)
-    row = partial(
-        _row,
-        model,
-        problem,
-        kept=sum(s.found.feasible for s in samples),
-        samples=len(samples),
-        equal_s=_time_to_equal_score(samples, designed),
-    )
-    wall = sum(s.wall_s for s in samples) / min(process_count(), len(samples))
-    if not BASELINES[name].random:
-        return [row(name, s.found, wall_s=wall) for s in ranked]
-    n = len(ranked)
+    ranked, n = sorted(samples, key=_drive_rank), len(samples)
+    kept, wall = sum(s.found.feasible for s in samples), sum(s.wall_s for s in samples) / min(process_count(), n)
+    equal = _time_to_equal_score(samples, designed)
+    shown = {f"{name}, best of {n}": ranked[0].found, f"{name}, median of {n}": ranked[(n - 1) // 2].found}
     return [
-        row(f"{name}, best of {n}", ranked[0].found, wall_s=wall),
-        row(f"{name}, median of {n}", ranked[(n - 1) // 2].found, wall_s=wall),
+        _judged_row(called, c.manoeuvre, _judge(model, problem, c), kept, n, wall, equal)
+        for called, c in (shown if BASELINES[name].random else {name: ranked[0].found}).items()
     ]
 
 
-def _row(
-    model: Model,
-    problem: Problem,
-    name: str,
-    c: ScoredDrive,
-    kept: int,
-    samples: int,
-    wall_s: float,
-    equal_s: float | None,
-) -> ComparisonRow:
-    judged = score(model, problem, c.manoeuvre.sample(float(model.machine.sampling_hz)), c.start)
-    return _judged_row(name, c.manoeuvre, judged, kept, samples, wall_s, equal_s)
+def _judge(model: Model, problem: Problem, c: ScoredDrive) -> Score:
+    return score(model, problem, c.manoeuvre.sample(float(model.machine.sampling_hz)), c.start)
 
 
 def _own_row(name: str, judged: Score) -> ComparisonRow:

@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from excite.model import Model
-from excite.model.machine import Machine, Shape
+from excite.model.machine import Machine
 from excite.model.mechanics import body_motions
 
 POSES = 2000  # random poses in which pairs are looked at; finds one in a thousand with 86 % probability
@@ -125,12 +125,10 @@ def _pieces(machine: Machine, q: ca.SX) -> list[Piece]:
     ]
     for body in machine.body:
         R, P = frames[body.index]
-        pieces += [_placed(body.name, shape, R, P) for shape in body.shape]
+        for shape in body.shape:
+            ends = tuple(P + R @ ca.SX(np.array(end)) for end in shape.ends)
+            pieces.append(Piece(body.name, ends, float(shape.radius)))
     return pieces
-
-
-def _placed(owner: str, shape: Shape, R: ca.SX, P: ca.SX) -> Piece:
-    return Piece(owner, tuple(P + R @ ca.SX(np.array(end)) for end in shape.ends), float(shape.radius))
 
 
 def body_frames(machine: Machine, q: ca.SX) -> dict[int, tuple[ca.SX, ca.SX]]:

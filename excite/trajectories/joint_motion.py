@@ -54,10 +54,9 @@ LIMITS_HZ = {"fourier": 20.0, "free": 40.0}  # rate of the samples at which the 
 FORCED = ("torque", "torque_rate", "power")  # kinds of limits that another machine on the same path has of its own
 DENSE_PER_SAMPLE = 20  # points per sample at which limits of a result are judged, at most; chosen
 DENSE_HZ = 2000.0  # rate of these points that suffices: a tenth of a knot's time is 20 ms
-FIRST_MARGIN = 2e-3  # share of a limit's range kept free in the program, for what happens between its samples; chosen
+FIRST_MARGIN = 4e-3  # share of a limit's range kept free in the program, for what happens between its samples; chosen
 REPAIR_FACTOR = 1.2  # further margin over the excess that it is for; chosen
-LEAST_REPAIR = 1e-3  # least further margin, share of half a limit's range; chosen
-MAX_MARGIN = 0.8  # largest margin, share of half a limit's range; chosen
+MAX_MARGIN = 1.0  # largest margin, share of half a limit's range: the bound is then the middle; chosen
 SOLVER_TOLERANCE = 1e-6  # of SLSQP, in the objective; chosen
 RESTART_GAIN = 1e-3  # gain of the objective that justifies another beginning; chosen
 SINGULAR_VALUE = 1e3  # objective where no parameter set is identifiable, above any other; chosen
@@ -206,11 +205,18 @@ class JointMotion:
 def between_samples(
     model: Model, problem: Problem, motion: JointMotion, kinds: Sequence[str] | None = None
 ) -> dict[str, float]:
-    """Return the largest excess over every limit between samples, as a fraction of its range.
+    """Return the largest excess over every limit between samples, as a fraction of its range; `excess_over_time`."""
+    _, excess = excess_over_time(model, problem, motion, kinds)
+    return {name: float(np.abs(e).max()) for name, e in excess.items()}
 
-    kinds: keys of LIMITS, to look at these alone; None for all.
 
-    It is judged DENSE_PER_SAMPLE times per sample, or at DENSE_HZ if that is less.
+def excess_over_time(
+    model: Model, problem: Problem, motion: JointMotion, kinds: Sequence[str] | None = None
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return times (N,) [s] and by how much every limit is exceeded (N,), as a fraction of its range.
+
+    Positive above the highest value, negative below the lowest. kinds: keys of LIMITS, to look at these alone; None for
+    all. It is judged DENSE_PER_SAMPLE times per sample, or at DENSE_HZ if that is less.
 
     Torque rates are those over one sample's time, from any of these points on: a drive delivers torques that are linear
     between samples.
@@ -230,10 +236,21 @@ def between_samples(
         *(stack_limits(model, limits)(q.T, nu.T, u.T, du.T).full() if limits else ()),
         *(stack_planned(model, planned)(a.T, motion.at(t, 3).T).full() if planned else ()),
     ]
-    return {
-        g.name: max(0.0, float(v.max() - g.high), float(g.low - v.min())) / g.range
+    return t, {
+        g.name: (np.maximum(v - g.high, 0.0) + np.minimum(v - g.low, 0.0)) / g.range
         for g, v in zip((*limits, *planned), values, strict=True)
     }
+
+
+def exceeded(
+    model: Model, problem: Problem, motion: JointMotion, others: Sequence[Model] = ()
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return `excess_over_time` of the model, and of the torques of other machines where theirs is larger."""
+    t, found = excess_over_time(model, problem, motion)
+    for other in others:
+        for name, e in excess_over_time(other, problem, motion, FORCED)[1].items():
+            found[name] = np.where(np.abs(e) > np.abs(found[name]), e, found[name])
+    return t, found
 
 
 def all_violations(
@@ -274,7 +291,8 @@ def with_smooth_friction(model: Model) -> Model:
 class MotionProgram:
     """The program of a joint motion in x (n_x,), its free coefficients: an objective and limits scaled to -1 ... 1.
 
-    sharpness: of the objective's maximum. margins (n_g,): share of each limit's half range that is kept free.
+    sharpness: of the objective's maximum. margins (2, N, n_g): share of each limit's half range that is kept free below
+    its highest and above its lowest value, at every sample.
     """
 
     def __init__(self, model: Model, problem: Problem, objective: CompositeObjective, basis: Basis) -> None:
@@ -291,13 +309,13 @@ class MotionProgram:
         others = objective.machines[1:]
         self.limits = (*machine, *forced * len(others), *planned)
         self.n_g = len(self.limits)
-        self.margins = np.full(self.n_g, FIRST_MARGIN)
         rate, T = float(model.machine.sampling_hz), basis.duration
         n_w = round(T * min(OBJECTIVE_HZ, rate)) + 1
         # samples of the log per sample of the program
         self._column_scale = objective.scale * np.sqrt((round(T * rate) + 1) / n_w)
         self._path, self._B = self._tables(np.linspace(0, T, n_w), 3)
         self._limit_path, self._limit_B = self._tables(np.linspace(0, T, round(T * LIMITS_HZ[basis.kind]) + 1), 4)
+        self.margins = np.full((2, len(self._limit_path), self.n_g), FIRST_MARGIN)
         self._bounded = np.array([np.isfinite(g.low) for g in self.limits], bool)
         self._functions(model, machine, [m.nominal for m in others], forced, planned)
 
@@ -333,12 +351,13 @@ class MotionProgram:
             values.append(stack_limits(model, limits)(q, nu, u, ca.jtimes(u, z, ca.vertcat(nu, a, jerk))))
         centre, half = np.array([_centre(g) for g in self.limits]), np.array([_half(g) for g in self.limits])
         scaled = (ca.vertcat(*values, stack_planned(model, planned)(a, jerk)) - centre) / half
-        slope = ca.jacobian(scaled, y)
-        pattern = np.array(ca.DM(slope.sparsity(), 1).full(), bool).reshape(self.n_g, 4, n_q)
+        pattern = np.array(ca.DM(ca.jacobian_sparsity(scaled, y), 1).full(), bool).reshape(self.n_g, 4, n_q)
         self._depends: np.ndarray = np.asarray(pattern.any(axis=1))
         N = len(self._limit_path)
         self._g = _mapped([y], scaled, N, (self.n_g,))
-        self._g_jacobian = _mapped([y], slope, max(1, 2 * self.n_g), (4 * n_q, self.n_g))
+        sign = ca.SX.sym("sign", self.n_g)
+        self._slack_slope = _mapped([y, sign], ca.jtimes(scaled, y, sign, True), max(1, 2 * self.n_g), (4 * n_q,))
+        self._signs = np.vstack([-np.eye(self.n_g), np.diag(np.where(self._bounded, 1.0, 0.0))])
 
     @property
     def size(self) -> int:
@@ -418,30 +437,28 @@ class MotionProgram:
     def slack(self, x: np.ndarray) -> np.ndarray:
         """Return what is left of every limit (2 n_g,) at its highest and lowest sample, negative where exceeded."""
         g = self.limit_values(x)
-        below = np.where(self._bounded, g.min(axis=0) + 1 - self.margins, 1.0)
-        return np.concatenate([1 - self.margins - g.max(axis=0), below])
+        below = np.where(self._bounded, (g + 1 - self.margins[1]).min(axis=0), 1.0)
+        return np.concatenate([(1 - self.margins[0] - g).min(axis=0), below])
 
     def slack_jacobian(self, x: np.ndarray) -> np.ndarray:
         """Return the derivative (2 n_g, n_x) of `slack`, at the samples that are highest and lowest."""
         g = self.limit_values(x)
-        sample = np.concatenate([g.argmax(axis=0), g.argmin(axis=0)])
-        limit = np.tile(np.arange(self.n_g), 2)
+        sample = np.concatenate([(g + self.margins[0]).argmax(axis=0), (g - self.margins[1]).argmin(axis=0)])
         y = self._states(x, self._limit_path[sample], self._limit_B[sample])
-        (J,) = self._g_jacobian(y)
-        local = J[np.arange(2 * self.n_g), :, limit].reshape(-1, 4, self.n_q)
+        (slope,) = self._slack_slope(y, self._signs)
+        local = slope.reshape(-1, 4, self.n_q)
         full = np.matmul(local.transpose(0, 2, 1), self._limit_B[sample]).reshape(-1, self.n_q * self.n_c)
-        full = full[:, self._columns]
-        sign = np.concatenate([-np.ones(self.n_g), np.where(self._bounded, 1.0, 0.0)])
-        return np.asarray(sign[:, None] * full)
+        return np.asarray(full[:, self._columns])
 
     def room(self, x: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Return the factor (n_q,) by which each joint's motion about a pose may grow, by position and speed.
 
-        x, pose (n_x,): the motion, and the pose alone. Without such limits a joint's amplitude is USUAL_AMPLITUDE.
+        x, pose (n_x,): the motion, and the pose alone. Without such limits a joint's amplitude is USUAL_AMPLITUDE. The
+        least room is a tenth of a limit, as a joint at the end of its range can still move the other way.
         """
         base = self.limit_values(pose)
         moved = np.abs(self.limit_values(x) - base).max(axis=0)
-        left = np.maximum(1 - np.abs(base).max(axis=0), 0.0)
+        left = np.maximum(1 - np.abs(base).max(axis=0), 0.1)
         found = np.full(self.n_q, np.inf)
         for k, g in enumerate(self.limits):
             if g.kind in ("position", "rate"):
@@ -451,11 +468,22 @@ class MotionProgram:
         usual = USUAL_AMPLITUDE / np.maximum(np.abs(q[:, : self.n_q]).max(axis=0), 1e-9)
         return np.where(np.isfinite(found), found, usual)
 
-    def widen_margins(self, violations: Mapping[str, float]) -> None:
-        """Add to the margins of limits that a motion exceeds; violations as fractions of their ranges."""
-        over = np.array([violations.get(g.name, 0.0) * g.range / _half(g) for g in self.limits])
-        more = np.where(over > 0, REPAIR_FACTOR * over + LEAST_REPAIR, 0.0)
-        self.margins = np.minimum(self.margins + more, MAX_MARGIN)
+    def widen_margins(self, x: np.ndarray, t: np.ndarray, excess: Mapping[str, np.ndarray]) -> None:
+        """Lower the bounds beside each point where x exceeds a limit, below what the program sees of it there.
+
+        t (N,), excess: as from `excess_over_time`. Friction that turns faster than in the program, and what happens
+        between its samples, is thus met where it happens.
+        """
+        g, last = self.limit_values(x), len(self._limit_path) - 1
+        place = t / self.basis.duration * last
+        beside = np.concatenate([np.floor(place), np.ceil(place)]).astype(int)
+        for k, limit in enumerate(self.limits):
+            over = np.tile(excess[limit.name] * limit.range / _half(limit), 2)
+            for side, sign in enumerate((1.0, -1.0)):
+                most = np.zeros(last + 1)
+                np.maximum.at(most, beside, sign * over)
+                more = np.where(most > 0, 1 - sign * g[:, k] + REPAIR_FACTOR * most + FIRST_MARGIN, 0.0)
+                self.margins[side, :, k] = np.minimum(np.maximum(self.margins[side, :, k], more), MAX_MARGIN)
 
     # ------------------------------------------------------------------------------------------ solve
 
@@ -468,15 +496,14 @@ class MotionProgram:
         a coefficient may move before that [rad, m]. The first steps know no curvature and may leave the limits far
         behind: a motion that is near its optimum needs a small one.
         """
-        best: list[tuple[float, np.ndarray]] = []
+        best = np.inf, np.inf, np.array(x)
         latest, done = np.array(x), 0
 
         def keep(x: np.ndarray) -> None:
-            nonlocal latest, done
+            nonlocal best, latest, done
             latest, done = np.array(x), done + 1
-            value = self.value(latest)
-            if (self.slack(latest) > -self.tolerated).all() and (not best or value < best[0][0]):
-                best[:] = [(value, latest)]
+            over = float(np.maximum(0.0, -self.slack(latest).min(initial=0.0) - FIRST_MARGIN / 10))
+            best = min(best, (over, self.value(latest), latest), key=lambda b: b[:2])
             if should_stop() or done >= max_iterations:
                 raise _StopSearch
 
@@ -486,7 +513,7 @@ class MotionProgram:
         slsqp: Any = minimize  # its types know no callback that ends it
         try:
             while True:
-                latest = best[0][1] if best and np.isfinite(reach) else latest
+                latest = best[2] if np.isfinite(reach) else latest
                 slsqp(
                     self.value_and_gradient,
                     latest,
@@ -497,18 +524,13 @@ class MotionProgram:
                     callback=keep,
                     options={"maxiter": max_iterations, "ftol": SOLVER_TOLERANCE},
                 )
-                now = best[0][0] if best else float("inf")
+                now = best[1] if best[0] == 0 else float("inf")
                 if not now < before - RESTART_GAIN:
                     break
                 before = now
         except _StopSearch:
             pass
-        return MotionOptimum(best[0][1] if best else latest, latest, done)
-
-    @property
-    def tolerated(self) -> np.ndarray:
-        """Excess (2 n_g,) over the margins that still keeps the limits at their samples."""
-        return np.tile(self.margins, 2)
+        return MotionOptimum(best[2], latest, done)
 
 
 def reachable_limits(model: Model, limits: tuple[Limit, ...]) -> tuple[Limit, ...]:
@@ -530,7 +552,7 @@ class _StopSearch(Exception):
 
 @dataclass(frozen=True)
 class MotionOptimum:
-    """Result of a solve: the best point (n_x,) that keeps the limits at their samples, or the last; and the last."""
+    """Result of a solve: the best point (n_x,) that keeps the limits at their samples, or nearly; and the last."""
 
     x: np.ndarray
     last: np.ndarray

@@ -30,6 +30,7 @@ from excite.trajectories.joint_motion import (
     JointMotion,
     MotionProgram,
     all_violations,
+    exceeded,
     motion_basis,
     violations_as_followed,
     with_smooth_friction,
@@ -37,6 +38,7 @@ from excite.trajectories.joint_motion import (
 from excite.trajectories.limits import (
     LIGHTEN,
     TOLERANCE,
+    check_limits,
     chosen_poses,
     describe_overload,
     end_poses,
@@ -44,6 +46,7 @@ from excite.trajectories.limits import (
     stack_limits,
 )
 from excite.trajectories.multistart import (
+    NO_START_YET,
     Design,
     Report,
     begin_worker,
@@ -52,6 +55,7 @@ from excite.trajectories.multistart import (
     no_drive_yet,
     process_count,
     progress_reports,
+    reported_score,
     stop_file,
     write_stage,
 )
@@ -63,7 +67,7 @@ START_REACH = 0.7  # share of a joint's range that they are drawn from: a start 
 SHRINK, SHRINKS = 0.7, 6  # factor of a guess outside of its limits, and how often it is applied; chosen
 DRAWN_BACK = (0.995, 0.98, 0.95, 0.9, 0.8)  # factors of coefficients that keep limits in the end; chosen
 DRAWN_BACK_FOLLOWED = (0.998, 0.995, 0.99, 0.98, 0.95)  # those that keep limits as followed; chosen
-REPAIR_ITERATIONS = 60  # of a solve with larger margins; chosen
+REPAIR_ITERATIONS = 30  # of a solve with larger margins; chosen
 ROUNDING = 1e-6  # excess that counts as none, share of a limit's range; chosen
 REPAIRS = 3  # solves with larger margins; chosen
 
@@ -184,7 +188,7 @@ def design_joint_motion(
                     states[state.number] = state
         interrupted = stop.exists()
     if not states:
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(NO_START_YET)
     best = min(states.values(), key=lambda t: (*t.best.rank, t.number))
     complete = len(states) == len(begins) and all(t.complete for t in states.values())
     if best.best.excess > TOLERANCE:
@@ -194,6 +198,7 @@ def design_joint_motion(
     chosen = keep_as_followed(model, problem, composite, best.best)
     states[best.number] = replace(best, best=chosen)
     motion = _as_motion(model, problem, chosen.basis, chosen.coefficients).sample(model)
+    reported = {k: reported_score(composite, t.best.score, t.best.excess) for k, t in states.items()}
     return Design(
         composite.name,
         Manoeuvre(motion.t, motion.u),
@@ -203,19 +208,15 @@ def design_joint_motion(
         min(t.start_cond_phi for t in states.values()),
         dict(chosen.violations),
         chosen.excess,
-        tuple(_reported(composite, states[k].best) if k in states else float("inf") for k in range(len(begins))),
+        tuple(reported.get(k, float("inf")) for k in range(len(begins))),
         complete,
         "slsqp",
         best.iterations,
         trajectory,
         chosen.followed,
         tuple(states[k].begun_from for k in range(starts) if k in states),
+        interrupted,
     )
-
-
-def _reported(objective: CompositeObjective, found: ScoredMotion) -> float:
-    kept = found.excess <= TOLERANCE
-    return objectives.reported_value(objective.name, found.score) if kept else float("inf")
 
 
 def _as_motion(model: Model, problem: Problem, basis: str, coefficients: np.ndarray) -> JointMotion:
@@ -258,7 +259,8 @@ def _run_start(
     state = None
     for k, found in enumerate(search(model, problem, objective, trajectory, begin, should_stop)):
         state = replace(found, number=number)
-        write_stage(model, stop, number, k, _reported(objective, state.best), state.best.violations)
+        score = reported_score(objective, state.best.score, state.best.excess)
+        write_stage(model, stop, number, k, score, state.best.violations)
     return state
 
 
@@ -292,16 +294,18 @@ def search(
             x = _carried_over(before, program, x)
         program.sharpness = stage.sharpness
         program.objective = _calibrated(model, problem, objective, best)
-        for repair in range(1 + (REPAIRS if stage is stages[-1] else 1)):
+        for repair in range(1 + REPAIRS * (stage is stages[-1])):
             most = REPAIR_ITERATIONS if repair else stage.iterations
-            found = program.solve(x, should_stop, most, NEAR_REACH if isinstance(begin, Motion) else np.inf)
+            reach = NEAR_REACH if isinstance(begin, Motion) or repair else np.inf
+            found = program.solve(x, should_stop, most, reach)
             iterations += found.iterations
             x = found.x
             scored = score_joint_motion(model, problem, objective, stage.basis, program.coefficients(x))
             best = min(best, scored, _drawn_back(model, problem, objective, scored), key=lambda s: s.rank)
             if scored.excess <= ROUNDING or should_stop():
                 break
-            program.widen_margins(scored.violations)
+            made = _as_motion(model, problem, stage.basis, scored.coefficients)
+            program.widen_margins(x, *exceeded(model, problem, made, objective.machines[1:]))
             over = max(scored.violations.get(name, 0.0) for name in (SIGMA_MAX, COND_MAX))
             program.objective = composite_objective.lower_ceilings(program.objective, over)
         yield MotionState(0, best, first, guess, iterations, not should_stop())
@@ -325,7 +329,11 @@ def _drawn_back(model: Model, problem: Problem, objective: CompositeObjective, f
     """Return a motion that exceeds a limit with its coefficients reduced until it keeps all of them, or as it is."""
     basis = _as_motion(model, problem, found.basis, found.coefficients).basis
     for share in DRAWN_BACK if found.excess > ROUNDING else ():
-        less = score_joint_motion(model, problem, objective, found.basis, basis.shrunk(found.coefficients, share))
+        coefficients = basis.shrunk(found.coefficients, share)
+        at_samples = check_limits(model, problem, JointMotion(basis, coefficients).sample(model))
+        if max(at_samples.values(), default=0.0) > ROUNDING:
+            continue  # what happens between the samples, which takes longest to find, no longer counts
+        less = score_joint_motion(model, problem, objective, found.basis, coefficients)
         if less.excess <= ROUNDING:
             return less
     return found

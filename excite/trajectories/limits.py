@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import casadi as ca
 import numpy as np
@@ -257,11 +258,16 @@ def sample_symbols(model: Model) -> SampleSymbols:
 
 def machine_limits(model: Model, problem: Problem) -> tuple[Limit, ...]:
     """Return every limit that the machine and the problem state, in the order of LIMITS."""
+    return _stated(model, problem, tuple(LIMITS.items()))
+
+
+@lru_cache(maxsize=8)
+def _stated(model: Model, problem: Problem, kinds: tuple[tuple[str, LimitKind], ...]) -> tuple[Limit, ...]:
     s = sample_symbols(model)
     sample, names = [s.q, s.nu, s.u, s.du], ["q", "nu", "u", "du"]
     return tuple(
         Limit(name, ca.Function("limit", sample, [e], names, ["g"]), low, high, unit, kind)
-        for kind, stated in LIMITS.items()
+        for kind, stated in kinds
         for name, e, low, high, unit in stated.bounds(model, problem, s)
     )
 
@@ -294,6 +300,11 @@ def stack_planned(model: Model, limits: Sequence[Limit]) -> ca.Function:
 
 def stack_limits(model: Model, limits: Sequence[Limit]) -> ca.Function:
     """Return the function (q, nu, u, du) -> values (n_limits,)."""
+    return _stacked(model, tuple(limits))
+
+
+@lru_cache(maxsize=16)
+def _stacked(model: Model, limits: tuple[Limit, ...]) -> ca.Function:
     s = sample_symbols(model)
     sample = [s.q, s.nu, s.u, s.du]
     return ca.Function("limits", sample, [ca.vertcat(*[g.expression(*sample) for g in limits])], {"cse": True})

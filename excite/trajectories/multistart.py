@@ -33,7 +33,6 @@ from excite.trajectories.continuation import (
     SCREENING_STAGES,
     SOLVERS,
     STAGES,
-    ScoredDrive,
     SearchState,
     rank,
     refine,
@@ -45,7 +44,7 @@ from excite.trajectories.continuation import (
 )
 from excite.trajectories.excitation import Manoeuvre
 from excite.trajectories.lane import move_motion, place_along_lane
-from excite.trajectories.limits import LIGHTEN, describe_excess, describe_overload, end_poses
+from excite.trajectories.limits import LIGHTEN, TOLERANCE, describe_excess, describe_overload, end_poses
 
 
 class BestSoFar(float):
@@ -60,6 +59,7 @@ class BestSoFar(float):
 
 
 Report = Callable[[int, int, BestSoFar], None]
+NO_START_YET = "no start has come through its first stage yet"
 OVERLOAD_POSES = 1000  # random poses in which gravity is looked at where a drive exceeds a torque limit
 MIN_LATER_STEPS = len(STAGES) - SCREENING_STAGES + 1  # progress reports of a selected start, at least
 
@@ -70,8 +70,8 @@ class Design:
 
     cond_phi, cond_w: condition numbers over every sample of `motion`. cond_phi_start: of the best random start.
     violations: excess by limit, as a fraction of its range, 0 where kept. scores: the objective of every start as
-    reported, inf for an infeasible one. random: the drives that the search began from. complete: False if
-    interrupted or cut short by the budget. solver: a name in SOLVERS; iterations: of the solver, from the start
+    reported, inf for an infeasible one. random: the drives that the search began from. complete: False if stopped or
+    cut short by the budget; stopped: by Ctrl-C. solver: a name in SOLVERS; iterations: of the solver, from the start
     that won to this drive. trajectory: kind of joint motion, a name in TRAJECTORIES, None for torques; limits of a
     joint motion are also judged between samples. followed: excess over them where a position controller follows the
     motion, None if that was not simulated.
@@ -92,6 +92,7 @@ class Design:
     trajectory: str | None = None
     followed: dict[str, float] | None = None
     random: tuple[Manoeuvre | Motion, ...] = ()
+    stopped: bool = False
 
     @property
     def drive(self) -> Manoeuvre | Motion:
@@ -160,7 +161,7 @@ def design(
         gather(call(model, problem, composite, solver, t.number, 0, t, deadline, stop) for t in chosen)
         interrupted = stop.exists()
     if not states:
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(NO_START_YET)
     best = min(states.values(), key=lambda t: (t.failure is not None, *rank(t.best), t.number))
     complete = len(states) == len(guesses) and all(states[t.number].complete for t in chosen)
     if not best.best.feasible and interrupted:
@@ -170,6 +171,7 @@ def design(
     if not best.best.feasible:
         raise infeasible_error(model, composite, best.best.violations, complete)
     drive = best.best
+    reported = {k: reported_score(composite, t.best.score, t.best.excess) for k, t in states.items()}
     motion = simulate(model, drive.manoeuvre.sample(float(model.machine.sampling_hz)), q0=drive.start)
     along = place_along_lane(model, problem, [motion])
     motion = motion if along is None else move_motion(model, motion, along)
@@ -182,11 +184,12 @@ def design(
         min(t.start_cond_phi for t in states.values()),
         dict(drive.violations),
         drive.excess,
-        tuple(_score(composite, states[k].best) if k in states else float("inf") for k in range(len(guesses))),
+        tuple(reported.get(k, float("inf")) for k in range(len(guesses))),
         complete,
         solver,
         best.iterations,
         random=tuple(states[k].begun_from for k in range(starts) if k in states),
+        stopped=interrupted,
     )
 
 
@@ -234,35 +237,26 @@ def infeasible_error(
     name = max(violations, key=lambda limit: violations[limit])
     excess = violations[name]
     cut = "the search was cut short, give more time"
-    if name == SIGMA_MAX and objective.sigma_max is not None:
-        return InfeasibleError(
-            f"no drive found that is accurate enough: {name} {objective.sigma_max:g} % is exceeded by"
-            f" {format_percent(100 * excess)}, the worst parameter comes out at"
-            f" {format_percent(objective.sigma_max * (1 + excess), 3)} in the best attempt;"
-            f" {'allow more, or give a longer duration or more starts' if complete else cut}",
-            name,
-            excess,
-        )
-    overload = describe_overload(model, random_poses(model, OVERLOAD_POSES)) if name.startswith("torque u") else ""
-    if overload:
-        return InfeasibleError(
-            f"no drive found that keeps every limit: {describe_excess(model, name, excess)} in the best attempt:"
-            f" {overload}; narrow position_low and position_high to poses that it can hold, or {LIGHTEN}",
-            name,
-            excess,
-        )
+    said = f"no drive found that keeps every limit: {describe_excess(model, name, excess)} in the best attempt"
     more = "give another duration or more starts"
     change = more if name.startswith("rest ") else f"widen it, or {more}"
-    return InfeasibleError(
-        f"no drive found that keeps every limit: {describe_excess(model, name, excess)} in the best attempt;"
-        f" {change if complete else cut}",
-        name,
-        excess,
-    )
+    overload = describe_overload(model, random_poses(model, OVERLOAD_POSES)) if name.startswith("torque u") else ""
+    if name == SIGMA_MAX and objective.sigma_max is not None:
+        said = (
+            f"no drive found that is accurate enough: {name} {objective.sigma_max:g} % is exceeded by"
+            f" {format_percent(100 * excess)}, the worst parameter comes out at"
+            f" {format_percent(objective.sigma_max * (1 + excess), 3)} in the best attempt"
+        )
+        change = "allow more, or give a longer duration or more starts"
+    elif overload:
+        said += f": {overload}"
+        change = cut = f"narrow position_low and position_high to poses that it can hold, or {LIGHTEN}"
+    return InfeasibleError(f"{said}; {change if complete else cut}", name, excess)
 
 
-def _score(objective: CompositeObjective, c: ScoredDrive) -> float:
-    return objectives.reported_value(objective.name, c.score) if c.feasible else float("inf")
+def reported_score(objective: CompositeObjective, score: float, excess: float) -> float:
+    """Return a score as people read it, inf for a drive that exceeds a limit."""
+    return objectives.reported_value(objective.name, score) if excess <= TOLERANCE else float("inf")
 
 
 @contextmanager
@@ -353,7 +347,8 @@ def _run_start(
     stages = itertools.count(0 if state is None else SCREENING_STAGES)
 
     def report_stage(state: SearchState) -> None:
-        write_stage(model, stop, number, next(stages), _score(objective, state.best), state.best.violations)
+        score = reported_score(objective, state.best.score, state.best.excess)
+        write_stage(model, stop, number, next(stages), score, state.best.violations)
 
     if state is None:
         if number > 0 and should_stop():

@@ -71,7 +71,7 @@ def worst_sigma(variances: ca.SX, sharpness: ca.SX) -> ca.SX:
 
 
 def accuracy(variances: ca.SX, sharpness: ca.SX) -> ca.SX:
-    """log of the largest relative variance and of the mean relative standard deviation squared, half and half."""
+    """log of the square of the geometric mean of the largest and the mean relative standard deviation."""
     logs = ca.log(variances)
     return (_smooth_maximum(logs, sharpness) + 2 * (ca.logsumexp(logs / 2) - float(np.log(logs.numel())))) / 2
 
@@ -88,7 +88,7 @@ OBJECTIVES: dict[str, Objective] = {
     "A": Objective(a_optimal, "eigenvalues", True),
     "E": Objective(e_optimal, "eigenvalues", True),
     "worst": Objective(worst_sigma, "variances", True, "percent"),
-    "accuracy": Objective(accuracy, "variances", True),
+    "accuracy": Objective(accuracy, "variances", True, "percent"),
     # Magnitudes of rival effects, all other parameters free: to first order, the noncentrality of one effect against
     # the others is the inverse of its variance (T-optimality, Atkinson and Fedorov, Biometrika 62, 1975; Ds-optimality)
     "discrimination": Objective(worst_sigma, "variances", True, "percent", "rivals"),

@@ -15,7 +15,7 @@ from .design_request import (
 )
 from .design_workflow import (
     compare as compare,
-    compare_account as compare_account,
+    compare_from as compare_from,
     design as design,
     design_account as design_account,
     is_own_drive as is_own_drive,
@@ -39,7 +39,7 @@ from .identify_workflow import (
 )
 from .machine_check import check_machine as check_machine
 from .predict_workflow import predict as predict, predict_account as predict_account, predict_from as predict_from
-from .progress import PROGRESS_VARIABLE as PROGRESS_VARIABLE
+from .progress import PROGRESS_VARIABLE as PROGRESS_VARIABLE, Advance as Advance
 from .requests import (
     arm_problems as arm_problems,
     build_model as build_model,
@@ -57,7 +57,7 @@ from .score_workflow import (
     excesses as excesses,
     judge_limits as judge_limits,
     score as score,
-    score_account as score_account,
+    score_from as score_from,
 )
 from .simulate_workflow import doubtful_effects as doubtful_effects, with_effects as with_effects
 from .slip_workflow import slip as slip, slip_account as slip_account

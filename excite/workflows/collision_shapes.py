@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import combinations, pairwise, product
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -242,30 +242,81 @@ def _origin(element: ElementTree.Element) -> np.ndarray:
 
 
 def _surfaces(path: Path, link: ElementTree.Element, at: np.ndarray) -> list[np.ndarray]:
-    """Return the triangles (N, 3, 3) of a link's collision geometry, placed. Raises OSError, ValueError."""
-    import trimesh
-
+    """Return the triangles (N, 3, 3) of a link's collision geometry. Raises OSError, ValueError, ImportError."""
     found = []
     for element in link.findall("collision"):
         geometry = element.find("geometry")
         shape = None if geometry is None else next(iter(geometry), None)
         if shape is None:
             continue
-        if shape.tag == "mesh":
-            mesh = trimesh.load(_mesh_file(path, str(shape.get("filename"))), force="mesh")
-            mesh.apply_scale([float(x) for x in shape.get("scale", "1 1 1").split()])
-        elif shape.tag == "box":
-            mesh = trimesh.creation.box([float(x) for x in shape.get("size", "").split()])
-        elif shape.tag == "cylinder":
-            mesh = trimesh.creation.cylinder(float(shape.get("radius", "")), float(shape.get("length", "")))
-        elif shape.tag == "sphere":
-            mesh = trimesh.creation.icosphere(radius=float(shape.get("radius", "")))
-        else:
-            raise ValueError(f"link {link.get('name')}: a collision geometry {shape.tag} is unknown")
-        mesh.apply_transform(at @ _origin(element))
-        vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, POINT_SPACING_M, max_iter=20)
-        found.append(np.asarray(vertices)[faces])
+        try:
+            triangles = _mesh_triangles(path, shape) if shape.tag == "mesh" else _plain_triangles(shape)
+        except ValueError as err:
+            raise ValueError(f"link {link.get('name')}, collision geometry {shape.tag}: {err}") from None
+        placed = at @ _origin(element)
+        found.append(triangles @ placed[:3, :3].T + placed[:3, 3])
     return found
+
+
+def _mesh_triangles(path: Path, shape: ElementTree.Element) -> np.ndarray:
+    """Return the triangles (N, 3, 3) [m] of a mesh file. Raises OSError, ValueError, ImportError without trimesh."""
+    name = str(shape.get("filename"))
+    file = _mesh_file(path, name)
+    try:
+        import trimesh
+    except ImportError:
+        raise ImportError(f"the mesh {name} is read with trimesh: pip install 'excite[urdf]'") from None
+    mesh = trimesh.load(file, force="mesh")
+    mesh.apply_scale([float(x) for x in shape.get("scale", "1 1 1").split()])
+    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, POINT_SPACING_M, max_iter=20)
+    return np.asarray(np.asarray(vertices)[faces])
+
+
+def _plain_triangles(shape: ElementTree.Element) -> np.ndarray:
+    """Return triangles (N, 3, 3) [m] around a box, cylinder or sphere. Raises ValueError."""
+    if shape.tag == "box":
+        size = [_length(x) for x in shape.get("size", "").split()]
+        if len(size) != 3:
+            raise ValueError(f"size must be three lengths (got {shape.get('size')!r})")
+        half = np.array(size) / 2
+        sides = []
+        for axis, sign in product(range(3), (-1, 1)):
+            corners = half[[(axis + 1) % 3, (axis + 2) % 3]]
+            u, v = (np.linspace(-h, h, 2 + int(2 * h / POINT_SPACING_M)) for h in corners)
+            points = np.stack([np.full((len(u), len(v)), sign * half[axis]), *np.meshgrid(u, v, indexing="ij")], -1)
+            sides.append(_grid_triangles(np.roll(points, axis, axis=-1)))
+        return np.concatenate(sides)
+    if shape.tag not in ("cylinder", "sphere"):
+        raise ValueError("is unknown, known are box, cylinder, sphere and mesh")
+    radius = _length(shape.get("radius", ""))
+    parts = max(16, 1 + int(2 * np.pi * radius / POINT_SPACING_M))
+    turn = np.linspace(0, 2 * np.pi, parts + 1)
+    if shape.tag == "sphere":
+        tilt = np.linspace(0, np.pi, parts // 2 + 1)
+        outline = np.stack([np.sin(tilt), np.cos(tilt)]) * radius / np.cos(np.pi / parts) ** 2
+    else:
+        half_length = _length(shape.get("length", "")) / 2
+        across = np.linspace(0, radius, 2 + int(radius / POINT_SPACING_M)) / np.cos(np.pi / parts)
+        along = np.linspace(half_length, -half_length, 2 + int(2 * half_length / POINT_SPACING_M))
+        ends = np.full_like(across, half_length)
+        r = np.concatenate([across, np.full_like(along, across[-1]), across[::-1]])
+        outline = np.stack([r, np.concatenate([ends, along, -ends])])
+    r, z = outline[:, :, None]
+    return _grid_triangles(np.stack(np.broadcast_arrays(r * np.cos(turn), r * np.sin(turn), z), axis=-1))
+
+
+def _grid_triangles(points: np.ndarray) -> np.ndarray:
+    """Return the triangles (2 (M - 1) (N - 1), 3, 3) of a grid of points (M, N, 3)."""
+    a, b, c, d = points[:-1, :-1], points[1:, :-1], points[:-1, 1:], points[1:, 1:]
+    return np.concatenate([np.stack(t, axis=2).reshape(-1, 3, 3) for t in ((a, b, d), (a, d, c))])
+
+
+def _length(text: str) -> float:
+    """Return a positive length [m]. Raises ValueError."""
+    value = float(text)
+    if not 0 < value < math.inf:
+        raise ValueError(f"a length must be > 0 (got {text})")
+    return value
 
 
 def _mesh_file(path: Path, name: str) -> Path:

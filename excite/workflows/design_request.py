@@ -17,11 +17,20 @@ import numpy as np
 
 from excite import identification, logs, operator, simulation, text as wording, trajectories
 from excite.errors import InfeasibleError, MachineError, SolverError, UsageError
+from excite.interrupt import call_interruptible, note_first_interrupt
 from excite.model import Model, build, effects, hidden_zeros, with_given_zeros
 from excite.model.machine import EffectEntry, Problem, Quantity
 from excite.operator import PhasedDrive
 from excite.simulation import Motion
-from excite.trajectories import AccuracyBound, CompositeObjective, Design, Manoeuvre, design_drive
+from excite.trajectories import (
+    AccuracyBound,
+    BestSoFar,
+    CompositeObjective,
+    Design,
+    Manoeuvre,
+    Report,
+    design_drive,
+)
 from excite.workflows import requests
 from excite.workflows.payload_design import loaded_machines, payload_contrasts, payload_summary
 
@@ -33,6 +42,7 @@ BOUNDED: dict[str, Callable[[np.ndarray], float]] = {
     "accuracy": lambda sigma: float(np.sqrt(sigma.max() * sigma.mean())),
 }
 CEILINGS = (trajectories.COND_MAX, trajectories.SIGMA_MAX)  # limits of a search that are no limits of a drive
+OTHER_END = "accurate"  # folder of the drive for accuracy alone, in that of a design
 SINGULAR_COND = 1e12  # cond(Phi) from which an arm's information matrix is singular to working accuracy; chosen
 POOR_PERCENT = 5.0  # attainable standard deviation [%] above which the summary gives advice; chosen
 ROBUST_MACHINES = 5  # machines of a robust design; chosen
@@ -179,33 +189,22 @@ def singular_message(problem: str) -> str:
     return f"some parameter moves nothing in problem {problem}, so no drive shows it"
 
 
-def design_from(
-    model: Model, problem: Problem, request: DesignRequest, progress: Callable[[int, int, float], None] | None = None
-) -> DesignResult:
+def design_from(model: Model, problem: Problem, request: DesignRequest, progress: Report | None = None) -> DesignResult:
     """Design a drive for a model and a problem as requested.
 
     Raises MachineError for sensors of unknown noise, UndrivableError for a drive that no person can follow, and the
     errors of `trajectories.design`, `logs.prepare` and `identification.identify`.
     """
     model, given = without_hidden_zeros(model)
-    return replace(_design(model, problem, request, progress), given_zeros=given)
-
-
-def _design(
-    model: Model, problem: Problem, request: DesignRequest, progress: Callable[[int, int, float], None] | None
-) -> DesignResult:
-    """Design a drive for a model all of whose encoder zeros show in it; errors as of `design_from`."""
     request = check_arm_options(model, request)
     model, assumed = with_assumed_noise(model)
     found = _design_with_noise(model, problem, request, progress)
     if model.follows_positions and not found.design.cond_phi < SINGULAR_COND:
         raise np.linalg.LinAlgError(f"cond(Phi) {found.design.cond_phi:g}")
-    return replace(found, assumed_noise=assumed)
+    return replace(found, assumed_noise=assumed, given_zeros=given)
 
 
-def _design_with_noise(
-    model: Model, problem: Problem, request: DesignRequest, progress: Callable[[int, int, float], None] | None
-) -> DesignResult:
+def _design_with_noise(model: Model, problem: Problem, request: DesignRequest, progress: Report | None) -> DesignResult:
     """Design a drive for a machine whose sensors have noise figures; errors as of `design_from`."""
     if request.driver:
         operator.check_phase_length(model, problem, request.phase_min_s)
@@ -218,35 +217,22 @@ def _design_with_noise(
     aim = trajectories.compose_objective(model, request.objective, request.sigma_max, prior, machines, None, judged)
     if request.payload_kg is not None:
         aim = replace(aim, machines=loaded_machines(model, request.payload_kg))
+    until = None if request.budget_s is None else time.time() + request.budget_s
+    first = request.budget_s / 2 if request.budget_s and (request.driver or request.second_step) else request.budget_s
+    search = request.starts, request.seed, first, progress, (), request.solver, request.trajectory
+    found = design_drive(model, problem, aim, *search)
+    near = _NearSearch(model, problem, request, prior, until, progress, found.stopped)
+    if request.second_step:
+        return _make_accurate(near, aim, found)
     if not request.driver:
-        budget = request.budget_s if not request.second_step or request.budget_s is None else request.budget_s / 2
-        until = None if request.budget_s is None else time.time() + request.budget_s
-        lowest = design_drive(
-            model,
-            problem,
-            aim,
-            request.starts,
-            request.seed,
-            budget,
-            progress,
-            solver=request.solver,
-            trajectory=request.trajectory,
+        bound = _bound_on_objective(model, problem, request) if found.complete else None
+        return DesignResult(model, aim, found, contrasts=judged, bound=bound)
+    phases = request.phase_min_s, request.seed
+    with note_first_interrupt() as asked:
+        made = operator.design_phases(
+            model, problem, aim, found.motion, *phases, lambda: near.over or asked.stop, progress
         )
-        if not request.second_step:
-            bound = _bound_on_objective(model, problem, request) if lowest.complete else None
-            return DesignResult(model, aim, lowest, contrasts=judged, bound=bound)
-        return _make_accurate(model, problem, request, aim, lowest, prior, until)
-    begin = time.time()
-    half = None if request.budget_s is None else request.budget_s / 2
-    free = design_drive(model, problem, aim, request.starts, request.seed, half, progress, solver=request.solver)
-
-    def out_of_time() -> bool:
-        return request.budget_s is not None and time.time() > begin + request.budget_s
-
-    made = operator.design_phases(
-        model, problem, aim, free.motion, request.phase_min_s, request.seed, out_of_time, progress
-    )
-    return DesignResult(model, aim, operator.as_design(model, problem, free, made), made, contrasts=judged)
+    return DesignResult(model, aim, operator.as_design(model, problem, found, made), made, contrasts=judged)
 
 
 PAYLOAD_OBJECTIVE = "accuracy"  # of a payload, where none is asked for
@@ -314,95 +300,119 @@ def with_assumed_noise(model: Model) -> tuple[Model, tuple[str, ...]]:
     return replace(model, machine=machine.model_copy(update={"sensor": sensors})), tuple(found)
 
 
-@dataclass(frozen=True)
+@dataclass
 class _NearSearch:
-    """Searches that begin from drives that are known. until: time at which they end, None for no limit."""
+    """Searches that begin from drives that are known.
+
+    until: time at which they end, None for no limit. stopped: True after Ctrl-C; later searches are left out.
+    progress: as of `design_from`, with what is sought and the worst parameter so far in words.
+    """
 
     model: Model
     problem: Problem
     request: DesignRequest
     prior: np.ndarray | None
     until: float | None
+    progress: Report | None
+    stopped: bool = False
+
+    @property
+    def over(self) -> bool:
+        """True if there is no time for another search."""
+        return self.stopped or (self.until is not None and time.time() >= self.until)
 
     def find(
         self,
+        sought: str,
         objective: str,
         warm: Sequence[Manoeuvre | Motion],
         share: float,
         sigma_max: float | None = None,
         cond_max: float | None = None,
     ) -> Design | None:
-        """Return the best drive near some, None if none keeps every limit. share: of the time that is left.
+        """Return the best drive near some, None if none keeps every limit or time is up. share: of the time left.
 
-        sigma_max, cond_max: see `trajectories.compose_objective`. Raises KeyboardInterrupt.
+        sought: what is sought, in words. sigma_max, cond_max: see `trajectories.compose_objective`.
         """
-        left = None if self.until is None else share * (self.until - time.time())
-        if left is not None and left <= 0:
+        if self.over:
             return None
         aim = trajectories.compose_objective(self.model, objective, sigma_max, self.prior, cond_max=cond_max)
-        request = self.request
+        left = None if self.until is None else share * (self.until - time.time())
+        asked = self.request
         try:
-            return design_drive(
-                self.model,
-                self.problem,
-                aim,
-                0,
-                request.seed,
-                left,
-                None,
-                warm,
-                request.solver,
-                request.trajectory,
+            tell = _in_words(self.progress, sought, objective)
+            found = design_drive(
+                self.model, self.problem, aim, 0, asked.seed, left, tell, warm, asked.solver, asked.trajectory
             )
         except (InfeasibleError, SolverError):
             return None
+        except KeyboardInterrupt:
+            self.stopped = True
+            return None
+        self.stopped = found.stopped
+        return found
 
     def worst(self, drive: Manoeuvre | Motion) -> float:
-        """Return the attainable standard deviation [%] of the worst parameter along a drive."""
+        """Return the attainable standard deviation [%] of the worst parameter along a drive, inf after Ctrl-C."""
         rate = float(self.model.machine.sampling_hz)
-        motion = drive if isinstance(drive, Motion) else simulation.simulate(self.model, drive.sample(rate))
         aim = trajectories.compose_objective(self.model, "cond", prior=self.prior)
-        return float(trajectories.sigma_percent(aim, self.model, motion).max())
+
+        def sigma_percent() -> np.ndarray:
+            motion = drive if isinstance(drive, Motion) else simulation.simulate(self.model, drive.sample(rate))
+            return trajectories.sigma_percent(aim, self.model, motion)
+
+        try:
+            return float(call_interruptible(sigma_percent).max())
+        except KeyboardInterrupt:
+            self.stopped = True
+            return float("inf")
 
 
-def _make_accurate(
-    model: Model,
-    problem: Problem,
-    request: DesignRequest,
-    aim: CompositeObjective,
-    lowest: Design,
-    prior: np.ndarray | None,
-    until: float | None,
-) -> DesignResult:
+def _in_words(progress: Report | None, sought: str, objective: str) -> Report | None:
+    """Return a report of progress that says what is sought and the best value of its own objective so far."""
+    if progress is None:
+        return None
+
+    def report(done: int, total: int, best: BestSoFar) -> None:
+        value = f"{trajectories.describe_value(objective, best)} so far; " if np.isfinite(best) else ""
+        progress(done, total, BestSoFar(np.inf, f"{sought}: {value}{best.doing}"))
+
+    progress(0, 0, BestSoFar(np.inf, sought))
+    return report
+
+
+def _make_accurate(search: _NearSearch, aim: CompositeObjective, lowest: Design) -> DesignResult:
     """Find the most accurate drive (worst parameter) whose cond(Phi) is within `cond_slack` of the lowest one.
 
-    If a random start is still more accurate, the drive of lowest cond(Phi) that is as accurate takes its place. The
-    drive for accuracy alone is found as well, to compare with. until: time at which the search ends.
+    The drive for accuracy alone is found as well, to compare with. If a random start is more accurate than the drive
+    near the lowest cond(Phi), the drive of lowest cond(Phi) that is as accurate takes its place.
     """
-    search = _NearSearch(model, problem, request, prior, until)
-    found, ends = lowest, DesignResult(model, aim, lowest)
-    try:
-        cond_max = (1 + request.cond_slack / 100) * lowest.cond_phi
-        found = search.find("worst", [lowest.drive], 0.5, cond_max=cond_max) or lowest
-        reached = {k: search.worst(drive) for k, drive in enumerate(lowest.random)}
-        best = min(reached, key=lambda k: reached[k], default=None)
-        if best is not None and search.worst(found.drive) > reached[best]:
-            warm = [found.drive, lowest.random[best]]
-            found = search.find("cond", warm, 0.5, sigma_max=reached[best]) or found
-        other_end = request.other_end and not model.follows_positions  # a minute more, for an arm
-        accurate = search.find("accuracy", [found.drive], 1.0) if other_end else None
-        ends = replace(ends, accurate=accurate, random_percent=None if best is None else reached[best])
-    except KeyboardInterrupt:
-        lowest = replace(lowest, complete=False)
+    slack = search.request.cond_slack
+    near = f"the most accurate drive within {slack:g} % of cond(Phi) {wording.format_number(lowest.cond_phi, 4)}"
+    cond_max = (1 + slack / 100) * lowest.cond_phi
+    found = search.find(near, "worst", [lowest.drive], 0.5, cond_max=cond_max) or lowest
+    accurate = None
+    if search.request.other_end:
+        accurate = search.find("the drive for accuracy alone", "accuracy", [found.drive], 0.5)
+    reached = {k: search.worst(drive) for k, drive in enumerate(lowest.random) if not search.over}
+    best = None if search.stopped else min(reached, key=lambda k: reached[k], default=None)
+    if best is not None and search.worst(found.drive) > reached[best]:
+        beaten = accurate is not None and search.worst(accurate.drive) <= reached[best]
+        warm = [found.drive, accurate.drive if accurate is not None and beaten else lowest.random[best]]
+        sought = f"the lowest cond(Phi) with every parameter to {wording.format_percent(reached[best], 3)}"
+        found = search.find(sought, "cond", warm, 1.0, sigma_max=reached[best]) or found
+    random = None if best is None else reached[best]
+    ends = DesignResult(search.model, aim, lowest, accurate=accurate, random_percent=random)
+    complete = lowest.complete and found.complete and not search.stopped
     if found is lowest or np.isclose(found.cond_phi, lowest.cond_phi, rtol=1e-9):
-        return replace(ends, design=lowest)
+        return replace(ends, design=replace(lowest, complete=complete))
     found = replace(
         found,
         objective=lowest.objective,
         cond_phi_start=lowest.cond_phi_start,
         scores=lowest.scores,
         iterations=lowest.iterations + found.iterations,
-        complete=lowest.complete and found.complete,
+        complete=complete,
         violations={n: v for n, v in found.violations.items() if n not in CEILINGS},
     )
     return replace(ends, design=found, first=lowest)
@@ -467,7 +477,7 @@ def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, 
         summary["cond_slack_percent"] = max(request.cond_slack, 100 * (drive.cond_phi / result.first.cond_phi - 1))
         summary["lowest_cond"] = _end(result, result.first)
     if result.accurate is not None:
-        summary["most_accurate"] = _end(result, result.accurate)
+        summary["most_accurate"] = {**_end(result, result.accurate), "folder": OTHER_END}
     if result.random_percent is not None:
         summary["random_start_percent"] = result.random_percent
     if result.assumed_noise:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,8 @@ import numpy as np
 import pandas as pd
 
 from excite import reports, trajectories
-from excite.errors import MachineError, StoppedError, UsageError
+from excite.errors import MachineError, UsageError
+from excite.interrupt import note_first_interrupt
 from excite.logs import PlannedDrive, profile_of, read_drive, torque_column
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Problem
@@ -68,16 +69,11 @@ def design_model(
         try:
             found = design_request.design_from(model, chosen, request, advance)
         except np.linalg.LinAlgError:
-            raise MachineError(
-                f"{model.machine.name}: {design_request.singular_message(name)}; is an effect outside of what the drive"
-                " can reach?"
-            ) from None
-        except KeyboardInterrupt as stopped:
-            if not str(stopped):
-                raise
-            raise StoppedError(f"interrupted, nothing was written: {stopped}") from None
+            effects = "; is an effect outside of what the drive can reach?" if model.effects else ""
+            raise MachineError(f"{model.machine.name}: {design_request.singular_message(name)}{effects}") from None
     wall = time.perf_counter() - begin
-    return design_account(found, name, chosen, request, wall).write(place)
+    with note_first_interrupt():  # a drive that was found is written
+        return design_account(found, name, chosen, request, wall).write(place)
 
 
 def design_account(found: DesignResult, name: str, problem: Problem, request: DesignRequest, wall_s: float) -> Account:
@@ -102,10 +98,25 @@ def design_account(found: DesignResult, name: str, problem: Problem, request: De
             "sigma.png": partial(reports.sigma_figure, summary["sigma_percent"], title),
         },
         partial(reports.drive_frame, model, found.design.motion),
-        (partial(write_drive, model, found.design.motion),),
+        (
+            partial(write_drive, model, found.design.motion),
+            *(() if found.accurate is None else (partial(_write_other_end, found, name, problem, request, wall_s),)),
+        ),
         scene=partial(reports.motion_scene, model, found.design.motion) if model.follows_positions else None,
         joints=partial(reports.joints_frame, model, found.design.motion),
     )
+
+
+def _write_other_end(
+    found: DesignResult, name: str, problem: Problem, request: DesignRequest, wall_s: float, place: Path
+) -> None:
+    """Write the drive for accuracy alone as a design folder of its own, to choose it without another search."""
+    assert found.accurate is not None
+    aim = replace(found.aim, name="accuracy")
+    alone = replace(found, aim=aim, design=found.accurate, first=None, bound=None, accurate=None, random_percent=None)
+    folder = place / design_request.OTHER_END
+    folder.mkdir()
+    design_account(alone, name, problem, replace(request, objective="accuracy"), wall_s).write(folder)
 
 
 def write_drive(model: Model, motion: Motion, place: Path) -> None:
@@ -120,11 +131,11 @@ def is_own_drive(name: str) -> bool:
 
 
 def read_rivals(
-    option: str, against: Sequence[str | PlannedDrive], model: Model, problem: Problem
+    against: Sequence[str | PlannedDrive], model: Model, problem: Problem
 ) -> tuple[tuple[str, ...], dict[str, Score]]:
     """Split what a design is compared with into names of `BASELINES`, and scores of profiles by their files' names.
 
-    option: as an error begins. Drives without a file are called drive 1, drive 2 and so on. Raises UsageError for an
+    Drives without a file are called drive 1, drive 2 and so on. Raises UsageError for an
     unknown name or two drives of one name, MachineError for an arm, LogError.
     """
     if model.follows_positions:
@@ -136,10 +147,10 @@ def read_rivals(
     usual = tuple(name for name in named if not is_own_drive(name))
     files = [Path(name) for name in named if is_own_drive(name)]
     for name in usual:
-        requests.require_known(option, name, tuple(trajectories.BASELINES))
+        requests.require_known("--against", name, tuple(trajectories.BASELINES))
     twice = sorted({f.name for f in files if [g.name for g in files].count(f.name) > 1})
     if twice:
-        raise UsageError(f"{option}: two drives are called {twice[0]}, rename one: a row is named after its file")
+        raise UsageError(f"--against: two drives are called {twice[0]}, rename one: a row is named after its file")
     given = [one for one in against if not isinstance(one, str)]
     drives = {f.name: read_drive(f, model, any_rate=True) for f in files}
     drives |= {f"drive {k}": one for k, one in enumerate(given, 1)}
@@ -165,14 +176,28 @@ def compare(
     Raises UsageError, MachineError, LogError.
     """
     model = requests.build_model(machine, fit_sensor_effects=False)
+    _, account = compare_from(model, problem, samples, against, seed, budget, bar)
+    return account().write(place)
+
+
+def compare_from(
+    model: Model,
+    problem: str | None,
+    samples: int,
+    against: Sequence[str | PlannedDrive],
+    seed: int,
+    budget: float | None,
+    bar: Bar = no_bar,
+) -> tuple[Comparison, Callable[[], Account]]:
+    """Compare the designed drive of a model with usual ones; return the comparison and its account."""
     name, chosen = requests.choose_problem(model.machine, problem, None)
     model, zeros = design_request.without_hidden_zeros(model)
     design_request.require_noise_figures(model)
     requests.require_positive("--budget", budget, "s")
-    usual, own = read_rivals("--against", against, model, chosen)
+    usual, own = read_rivals(against, model, chosen)
     with bar("comparing") as advance:
         result = trajectories.compare(model, chosen, samples, seed, budget, advance, usual, own)
-    return compare_account(model, name, result, samples, seed, budget, zeros).write(place)
+    return result, partial(compare_account, model, name, result, samples, seed, budget, zeros)
 
 
 def compare_account(

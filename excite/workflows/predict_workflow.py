@@ -97,6 +97,7 @@ def predict_account(model: Model, estimate: Estimate, found: PredictResult, resu
 
 
 def _write_table(p: Prediction, place: Path) -> None:
+    """Write the table of a prediction into a folder."""
     p.table.to_csv(place / "prediction.csv", index=False)
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from excite import identification, reports, trajectories
-from excite.logs import read_drive
+from excite.logs import PlannedDrive, read_drive
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Problem
 from excite.reports import Account
@@ -35,17 +34,23 @@ def score(
     Raises UsageError, MachineError, LogError, SimulationError.
     """
     model = requests.build_model(machine, fit_sensor_effects=False)
+    drive = read_drive(profile, model, any_rate=True)
+    _, account = score_from(model, drive, str(profile), problem, sensors, kit, duration)
+    return account().write(place)
+
+
+def score_from(
+    model: Model, drive: PlannedDrive, called: str, problem: str | None, sensors: bool, kit: str, duration: float | None
+) -> tuple[Score, Callable[[], Account]]:
+    """Judge a drive as a design; return the score and its account. called: what the drive is called."""
     name, chosen = requests.choose_problem(model.machine, problem, duration)
+    requests.require_known("--kit", kit, KITS)
     model, given = design_request.without_hidden_zeros(model)
     model, assumed = design_request.with_assumed_noise(model)
     design_request.require_noise_figures(model)
-    drive = read_drive(profile, model, any_rate=True)
     found = trajectories.score(model, chosen, drive.torque, drive.start, drive.nu0, drive.planned)
-    requests.require_known("--kit", kit, KITS)
-    account = score_account(model, name, chosen, found, str(profile), kit if sensors else None, given)
-    if assumed:
-        account = replace(account, summary=account.summary | {"assumed_noise": list(assumed)})
-    return account.write(place)
+    valued = kit if sensors else None
+    return found, partial(score_account, model, name, chosen, found, called, valued, given, assumed)
 
 
 def score_account(
@@ -56,11 +61,13 @@ def score_account(
     profile: str,
     kit: str | None = None,
     given_zeros: Sequence[str] = (),
+    assumed_noise: Sequence[str] = (),
 ) -> Account:
     """Give an account of a drive judged on a problem of some name.
 
     profile: what the drive is called. kit: whose sensors are valued, None for none. given_zeros: encoder zeros that
-    are sought, but that no torque shows by itself: those of the machine file are taken.
+    are sought, but that no torque shows by itself: those of the machine file are taken. assumed_noise: sensors of an
+    arm whose noise figure is assumed.
     """
     summary: dict[str, Any] = {
         "machine": model.machine.name,
@@ -80,8 +87,8 @@ def score_account(
         "meanings": parameter_descriptions(model),
         "versions": requests.package_versions(),
     }
-    if given_zeros:
-        summary["given_zeros"] = list(given_zeros)
+    taken = {"given_zeros": list(given_zeros), "assumed_noise": list(assumed_noise)}
+    summary |= {key: names for key, names in taken.items() if names}
     title = f"{model.machine.title}: {name}, {Path(profile).name}"
     figures = {
         "design.png": partial(reports.design_figure, model, problem, found.motion, title),

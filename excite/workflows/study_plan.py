@@ -29,7 +29,7 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -203,15 +203,12 @@ class RandomSample(Axes):
     def cells(self) -> Iterator[Cell]:
         for k in range(self.count):
             rng = np.random.default_rng([self.sample_seed, k])
-            chosen = {n: _pick(getattr(self, n) or (None,), rng) for n in AXES}
+            choices = {n: getattr(self, n) or (None,) for n in AXES}
+            chosen: dict[str, Any] = {n: c[int(rng.integers(len(c)))] for n, c in choices.items()}
             chosen["duration_s"] = _draw_number(chosen["duration_s"], rng)
             chosen["limits"] = {n: _draw_number(v, rng) for n, v in chosen["limits"].items()}
             chosen["effects"] = tuple(_draw_magnitude(text, rng) for text in chosen["effects"])
             yield _cell(chosen)
-
-
-def _pick(values: Sequence[Any], rng: np.random.Generator) -> Any:
-    return values[int(rng.integers(len(values)))]
 
 
 def _draw_number(value: Any, rng: np.random.Generator) -> Any:

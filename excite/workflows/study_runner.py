@@ -1,6 +1,6 @@
 """Carry out a study of thousands of runs on one machine or a cluster, and resume it after any interruption.
 
-Drives are designed first, then the runs go to the workers in batches. Only this process writes: rows to a store
+Drives are designed first, then the runs go to the workers (`study_workers`). Only this process writes: rows to a store
 (`row_store`) that survives a kill, drives as whole folders. When every run is stored, the results appear as one folder:
 `runs.parquet` (one row per run, with its command), `summary.json`, figure, report, the drives and the machine files.
 """
@@ -11,7 +11,8 @@ import errno
 import hashlib
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from contextlib import closing
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -22,14 +23,11 @@ from excite import logs, output
 from excite.errors import FolderError, RowStoreError, WorkerError
 from excite.model import build_cached, effects
 from excite.model.machine import Machine, shipped_machines
-from excite.workflows import executors, requests, row_store, study_results, study_runs
-from excite.workflows.executors import Pool
+from excite.workflows import requests, row_store, study_results, study_runs, study_workers
 from excite.workflows.row_store import RowStore
 from excite.workflows.study_plan import Cell, DriveSpec, StudyPlan
-from excite.workflows.study_runs import DEFECT, FAILED, DesignJob, DesignOutcome, RunBatch, TorqueInput
+from excite.workflows.study_runs import DEFECT, FAILED, DesignJob, DesignOutcome, Run, RunInputs, TorqueInput
 
-BATCH_S = 0.5  # work in a batch [s]; chosen: a transaction of the store takes a hundredth of it
-MAX_BATCH_RUNS = 256  # chosen
 DRIVES = "drives"
 Progress = Callable[[int, int, str], None]  # done, total, what is being done
 
@@ -154,9 +152,8 @@ def _run_design_jobs(job_list: list[DesignJob], cluster: str | None) -> Iterator
         for job in job_list:
             yield job, study_runs.design_drive(job)
         return
-    with executors.open_pool(cluster=cluster) as workers:
-        for result in executors.run_pieces(study_runs.design_drive, job_list, workers):
-            yield result.piece, result.value or DesignOutcome("", {}, f"{DEFECT}: the search killed its worker")
+    for job, made in study_workers.compute(study_runs.design_drive, job_list, cluster=cluster):
+        yield job, made or DesignOutcome("", {}, f"{DEFECT}: the search killed its worker")
 
 
 @dataclass(frozen=True)
@@ -188,88 +185,56 @@ def _stored_drive(plan: StudyPlan, folder: Path, number: int) -> StoredDrive:
 # ------------------------------------------------------------------------------------------------ runs
 
 
-@dataclass
-class _BatchSize:
-    """Number of runs in a batch, from the time that runs take."""
-
-    size: int = 1
-
-    def learn(self, runs: int, seconds: float) -> None:
-        if seconds > 0:
-            self.size = int(min(MAX_BATCH_RUNS, max(1, BATCH_S * runs / seconds)))
-
-
 def _compute_runs(
     plan: StudyPlan, folder: Path, store: RowStore, jobs: int | None, cluster: str | None, progress: Progress
 ) -> None:
     """Compute and store the missing runs."""
-    there = store.numbers()
+    there, failed = store.numbers(), store.failures()
     done, total = len(there), plan.total
     progress(done, total, "running")
-    if done == total:
-        return
-    batch_size = _BatchSize()
-    with executors.open_pool(jobs, cluster) as workers:
-        for result in executors.run_pieces(
-            study_runs.run_batch, _batches(plan, folder, store, there, batch_size), workers, _split_batch
-        ):
-            rows = _batch_rows(result.piece, result.value, workers)
-            store.add_rows(rows, result.seconds)
-            batch_size.learn(len(rows), result.seconds)
-            done += len(rows)
+    missing = _missing_runs(plan, folder, there, failed)
+    with closing(study_workers.compute(study_runs.run_once, missing, jobs, cluster)) as outcomes:
+        for run, outcome in outcomes:
+            if outcome is None:
+                store.add(run.number, {"status": DEFECT, "reason": "killed the worker that computed it"})
+            elif outcome.program != study_runs.program_hash():
+                raise WorkerError("a worker has another version of the program: install the same everywhere")
+            else:
+                store.add(run.number, outcome.row, outcome.seconds)
+            done += 1
             progress(done, total, "running")
-    # runs whose drive failed
-    for number, reason in store.failures().items():
-        for c, cell in enumerate(plan.cells):
-            if plan.number[cell.drive] == number:
-                numbers = range(c * plan.study.runs, (c + 1) * plan.study.runs)
-                status = DEFECT if reason.startswith(DEFECT) else FAILED
-                store.add_rows(
-                    (n, {"status": status, "reason": f"no drive: {reason}"}) for n in numbers if n not in there
-                )
+    for c, cell in enumerate(plan.cells):
+        reason = failed.get(plan.number[cell.drive])
+        if reason is not None:
+            status = DEFECT if reason.startswith(DEFECT) else FAILED
+            for number in _missing_numbers(plan, c, there):
+                store.add(number, {"status": status, "reason": f"no drive: {reason}"})
     progress(total, total, "running")
 
 
-def _batch_rows(
-    batch: RunBatch, value: tuple[str, list[tuple[int, study_runs.Row]]] | None, workers: Pool
-) -> list[Any]:
-    if value is None:
-        return [(n, {"status": DEFECT, "reason": "killed the worker that computed it"}) for n, _ in batch.runs]
-    program, rows = value
-    if workers.foreign and program != study_runs.program_hash():
-        raise WorkerError("a worker of the cluster has another version of the program: install the same everywhere")
-    return rows
+def _missing_numbers(plan: StudyPlan, c: int, there: set[int]) -> list[int]:
+    """Return the numbers of the runs of cell c that are not stored."""
+    return [n for n in range(c * plan.study.runs, (c + 1) * plan.study.runs) if n not in there]
 
 
-def _split_batch(batch: RunBatch) -> list[RunBatch]:
-    return [replace(batch, runs=(one,)) for one in batch.runs]
-
-
-def _batches(
-    plan: StudyPlan, folder: Path, store: RowStore, there: set[int], batch_size: _BatchSize
-) -> Iterator[RunBatch]:
-    """Yield the missing runs in batches of one cell each."""
-    failed, runs = store.failures(), plan.study.runs
+def _missing_runs(plan: StudyPlan, folder: Path, there: set[int], failed: dict[int, str]) -> Iterator[Run]:
+    """Yield the runs that are not stored, cell by cell, except those without a drive."""
     stored = lru_cache(maxsize=4)(lambda k: _stored_drive(plan, folder, k))
     for c, cell in enumerate(plan.cells):
-        number = plan.number[cell.drive]
-        missing = [r for r in range(runs) if c * runs + r not in there]
-        if number in failed or not missing:
-            continue
-        whole, seeds = _cell_batch(plan, cell, stored(number)), plan.seeds(cell)
-        while missing:
-            now, missing = missing[: batch_size.size], missing[batch_size.size :]
-            yield replace(whole, runs=tuple((c * runs + r, int(seeds[r])) for r in now))
+        drive, numbers = plan.number[cell.drive], _missing_numbers(plan, c, there)
+        if drive not in failed and numbers:
+            inputs, seeds = _run_inputs(plan, cell, stored(drive)), plan.seeds(cell)
+            yield from (Run(inputs, n, int(seeds[n % plan.study.runs])) for n in numbers)
 
 
-def _cell_batch(plan: StudyPlan, cell: Cell, drive: StoredDrive) -> RunBatch:
+def _run_inputs(plan: StudyPlan, cell: Cell, drive: StoredDrive) -> RunInputs:
     machine = plan.machines[cell.drive.machine]
     true: Machine = machine
     if cell.effects:
         entries = [effects.parse_effect(text, machine, drive.duration_s) for text in cell.effects]
         true = effects.with_effects(machine, *entries)
     known = machine.model_dump_json()
-    return RunBatch(known, true.model_dump_json(), drive.torque, plan.study.steps, cell.kit, plan.method(cell), ())
+    return RunInputs(known, true.model_dump_json(), drive.torque, plan.study.steps, cell.kit, plan.method(cell))
 
 
 # ------------------------------------------------------------------------------------------------ results

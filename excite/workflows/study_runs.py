@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import threading
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -43,12 +44,11 @@ class TorqueInput:
 
 
 @dataclass(frozen=True)
-class RunBatch:
-    """Some runs of one cell.
+class RunInputs:
+    """What all runs of a cell share.
 
     known: the machine that identification knows (JSON).
     true: the machine that is simulated, with its effects (JSON).
-    runs: number and seed of each run.
     """
 
     known: str
@@ -57,7 +57,24 @@ class RunBatch:
     steps: tuple[str, ...]
     kit: str
     method: str
-    runs: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run by its number in the study, and the seed of its sensor noise."""
+
+    inputs: RunInputs
+    number: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """Row of a run, the time [s] it took, and `program_hash` of the worker that computed it."""
+
+    row: Row
+    seconds: float
+    program: str
 
 
 @lru_cache(maxsize=4)
@@ -70,24 +87,21 @@ def _motion(machine: str, drive: TorqueInput) -> Motion:
     return play_back(build_cached(machine), torque, np.array(drive.q0), np.array(drive.nu0), planned)
 
 
-def run_batch(batch: RunBatch) -> tuple[str, list[tuple[int, Row]]]:
-    """Compute a batch in order; return this worker's `program_hash`, and number and row of each run."""
-    with _CASADI_LOCK:
-        return program_hash(), [(number, run_once(batch, seed)) for number, seed in batch.runs]
-
-
-def run_once(batch: RunBatch, seed: int) -> Row:
-    """Compute one run; return its status, the reason if it failed, and the results of its steps.
+def run_once(run: Run) -> RunOutcome:
+    """Compute one run; its row has a status, the reason if it failed, and the results of its steps.
 
     Status `failed`: no estimate, no motion, or a log or machine that can't be used. Status `defect`: any other error,
     which does not end the study. Raises KeyboardInterrupt on Ctrl-C.
     """
-    return interrupt.call_interruptible(_run_with_status, batch, seed)
+    with _CASADI_LOCK:
+        begin = time.perf_counter()
+        row = interrupt.call_interruptible(_run_with_status, run)
+        return RunOutcome(row, time.perf_counter() - begin, program_hash())
 
 
-def _run_with_status(batch: RunBatch, seed: int) -> Row:
+def _run_with_status(run: Run) -> Row:
     try:
-        return {"status": DONE} | _run_steps(batch, seed)
+        return {"status": DONE} | _run_steps(run.inputs, run.seed)
     except (NoEstimateError, SimulationError, LogError, MachineError) as err:
         return {"status": FAILED, "reason": _one_line(err)}
     except Exception as err:
@@ -98,15 +112,15 @@ def _one_line(err: Exception) -> str:
     return " ".join(str(err).split())[:500]
 
 
-def _run_steps(batch: RunBatch, seed: int) -> Row:
-    known, steps = build_cached(batch.known), set(batch.steps)
+def _run_steps(inputs: RunInputs, seed: int) -> Row:
+    known, steps = build_cached(inputs.known), set(inputs.steps)
     row: Row = {}
     if not steps & {"simulate", "identify", "verify", "diagnose"}:
         return row
-    table = simulation.measure(build_cached(batch.true), _motion(batch.true, batch.drive), kit=batch.kit, seed=seed)
+    table = simulation.measure(build_cached(inputs.true), _motion(inputs.true, inputs.drive), kit=inputs.kit, seed=seed)
     row["log_sha256"] = hashlib.sha256(table.to_numpy(float).tobytes()).hexdigest()[:16]
     if steps & {"identify", "verify"}:
-        estimate = identification.identify_table(known, table, batch.method)
+        estimate = identification.identify_table(known, table, inputs.method)
         arrays = (estimate.value, estimate.std, *estimate.noise_interval95)
         row |= {name: _json_value(array.tolist()) for name, array in zip(ESTIMATE_COLUMNS, arrays, strict=True)}
         row["relative_error_percent"] = _json_value(estimate.relative_error_percent)

@@ -1,4 +1,4 @@
-"""Compute a lower bound on cond(Phi) of R60 (`excite.trajectories.bound`), from the states of the designed drives.
+"""Compute a lower bound on cond(Phi) of R60 (`bound.py`), from the states of the designed drives.
 
 python results/bound_R60/study.py [--rounds 80] [--minutes 45] [--out FOLDER] writes summary.json, certificate.json and
 bound.png. Drives are designed as well for longer times and without the limits that the bound does not use.
@@ -23,6 +23,7 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parents[1] / "tests"))
 
 import numpy as np
+from bound import Bound, bound
 from matplotlib.figure import Figure
 from support import studies
 
@@ -33,7 +34,6 @@ from excite.model.machine.machine import load_machine
 from excite.reports import COLOURS, save
 from excite.simulation import Motion, simulate
 from excite.trajectories import Manoeuvre, objective, place_on_lane
-from excite.trajectories.bound import Bound, bound
 from excite.workflows import DesignRequest
 from excite.workflows.design_request import design_from
 from excite.workflows.study_plan import scale_limits

@@ -18,6 +18,7 @@ from support.logs import logged
 
 from excite.app.course import draw_course
 from excite.app.day import Day
+from excite.app.job import Job
 from excite.app.key_lines import find_line
 from excite.app.live_view import draw_text
 from excite.logs import SUFFIXES
@@ -234,3 +235,36 @@ def test_the_window_lists_a_log_of_every_format_that_is_read(tmp_path: Path) -> 
     for other in ("profile.csv", "rig.toml", "sheet.pdf"):
         (tmp_path / other).write_text("")
     assert Day(tmp_path).known_logs() == every
+
+
+def test_the_time_left_is_that_of_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Job, "elapsed_s", 12.0)
+    job = object.__new__(Job)
+    for arguments, said in (
+        (("design", "va12"), ""),
+        (("design", "va12", "--budget", "60"), ", 48 s left to search"),
+        (("design", "va12", "--budget", "10"), ", about to end"),
+    ):
+        job.arguments = arguments
+        assert job.time_left == said
+
+
+def test_both_ends_of_a_design_are_there_to_choose(tmp_path: Path) -> None:
+    day = Day(tmp_path / "results")
+    day.choose("va12_straight")
+    summary = {"machine": "va12_straight", "problem": "S40", "objective": "cond", "duration_s": 40.0, "complete": True}
+    summary |= {"cond_w": 9.0, "cond_phi_start": 99.0, "max_violation": 0.0, "worst_parameter": "M", "advice": None}
+    for place, worst, cond in (("design", 2.6, 19.38), ("design/accurate", 0.87, 89.6)):
+        folder = tmp_path / "results" / place
+        folder.mkdir(parents=True)
+        own = {"cond_phi": cond, "worst_percent": worst, "sigma_percent": {"M": worst}, "median_percent": worst}
+        (folder / "summary.json").write_text(json.dumps(summary | own))
+    names = sorted(day.design_names().values())
+    assert names == [
+        "design/accurate: worst 0.87 % at cond(Phi) 89.6",
+        "design: worst 2.6 % at cond(Phi) 19.38",
+    ]
+    day.forms["drive"]["design"] = str(tmp_path / "results" / "design" / "accurate")
+    chosen = day.result_of("design")
+    assert chosen is not None
+    assert chosen.summary["cond_phi"] == 89.6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import json
 import os
@@ -9,12 +10,15 @@ import socket
 import stat
 import threading
 import time
+from collections.abc import Callable, MutableMapping
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote, urlsplit
 
 import pytest
 
 from excite.app.day import Day
+from excite.errors import DiskError
 
 pytest.importorskip("nicegui", reason="the extra app is not installed")
 
@@ -117,6 +121,31 @@ def test_the_server_never_answers_500(tmp_path: Path) -> None:
         assert request(address, "GET", "")[0] == 200
 
 
+@pytest.mark.parametrize("change", [Path.unlink, lambda path: os.truncate(path, 1_000_000)], ids=["deleted", "cut off"])
+def test_a_file_may_go_while_it_is_sent(change: Callable[[Path], None], tmp_path: Path) -> None:
+    from excite.app import server
+
+    path = tmp_path / "big.csv"
+    path.write_bytes(b"1\n" * 1_000_000)
+    sent: list[MutableMapping[str, Any]] = []
+
+    async def send(message: MutableMapping[str, Any]) -> None:
+        if not sent:
+            change(path)
+        sent.append(message)
+
+    async def receive() -> MutableMapping[str, Any]:
+        await asyncio.sleep(60)
+        return {"type": "http.disconnect"}
+
+    scope = {"type": "http", "method": "GET", "path": "/files/big.csv", "query_string": b"", "headers": []}
+    asyncio.run(server.web_app(Day(tmp_path))(scope, receive, send))
+    size = sum(len(message.get("body", b"")) for message in sent)
+    assert sent[0]["status"] == 200
+    assert size >= 1_000_000
+    assert int(dict(sent[0]["headers"]).get(b"content-length", size)) == size
+
+
 def test_the_browser_is_led_by_a_file_that_nobody_else_can_read(tmp_path: Path) -> None:
     from excite.app import server
 
@@ -124,3 +153,18 @@ def test_the_browser_is_led_by_a_file_that_nobody_else_can_read(tmp_path: Path) 
     assert stat.S_IMODE(door.stat().st_mode) == 0o600
     assert "secret" in door.read_text()
     assert "secret" not in str(door)
+
+
+def test_an_upload_without_room_is_one_line(tmp_path: Path) -> None:
+    from starlette.testclient import TestClient
+
+    from excite.app import server
+
+    def full(_: Path, replace: bool = True) -> None:
+        raise DiskError("log.csv: could not be written: No space left on device; free some space")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(server.output, "new_file", full)
+        answer = TestClient(server.web_app(Day(tmp_path))).post("/log/log.csv", content=b"t_s\n0\n")
+    assert answer.status_code == 400
+    assert answer.text == "log.csv: could not be written: No space left on device; free some space"

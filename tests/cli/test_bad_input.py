@@ -494,7 +494,7 @@ def test_estimates(ground: dict[str, Any], tmp_path: Path, count: int, seed: int
 
 WORDS = [
     *("--out", "--json", "--seed", "--kit", "--method", "--noise", "--effect", "--runs", "--problem", "--duration"),
-    *("--objective", "--starts", "--budget", "--samples", "--filter", "--validate", "--jobs", "--cluster", "--help"),
+    *("--objective", "--starts", "--budget", "--samples", "--validate", "--jobs", "--cluster", "--help"),
     *("--sigma-max", "--robust", "--after", "--phases", "--shortest", "--live", "--port", "-1", "0", "1e999", "nan"),
     *(
         "",

@@ -16,7 +16,8 @@ import pytest
 from support.commands import Excite
 
 import excite as package
-from excite.errors import UsageError
+from excite.cli import terminal
+from excite.errors import StoppedError, UsageError
 from excite.logs import profile as profiles
 from excite.model import Model
 from excite.simulation import Motion
@@ -309,4 +310,31 @@ def test_a_second_ctrl_c_does_not_disturb_the_end_of_the_first() -> None:
             time.sleep(0.1)
             run.send_signal(signal.SIGINT)
         _, more = run.communicate("", timeout=60)
-    assert (said, more, run.returncode) == ("excite: interrupted, nothing was written\n", "", 130)
+    assert said.startswith("excite: interrupted, nothing was written: the machine was being read")
+    assert (more, run.returncode) == ("", 130)
+
+
+@pytest.mark.parametrize(
+    ("reason", "said"), [("slip 3.6 % over", "slip 3.6 % over"), ("", "verifying was at step 3 of 8")]
+)
+def test_a_stop_ends_with_a_reason_in_words(reason: str, said: str) -> None:
+    def stopped_work() -> None:
+        with terminal.bar("verifying") as advance:
+            advance(3, 8, None)
+            raise KeyboardInterrupt(*([reason] if reason else []))
+
+    with pytest.raises(StoppedError, match=f"interrupted, nothing was written: {said}"):
+        stopped_work()
+
+
+def test_a_function_refuses_counts_and_torques_that_are_none(straight: Model) -> None:
+    for call in (
+        lambda: package.design(straight, starts=0),
+        lambda: package.compare(straight, samples=0),
+        lambda: package.verify(straight, "a.csv", runs=1.5),  # type: ignore[arg-type]
+        lambda: package.simulate(straight, "a.csv", seed=-1),
+    ):
+        with pytest.raises(UsageError, match=r"(starts|samples|runs|seed): must be a whole number of at least [01]"):
+            call()
+    with pytest.raises(UsageError, match=r"drive: torques need shape \(N >= 2, 2\) for u1, u4 \(got \(5, 5\)\)"):
+        package.simulate(straight, np.zeros((5, 5)))

@@ -292,6 +292,24 @@ KINDS: dict[str, Callable[[Model], Figure]] = {
 }
 
 
+def test_a_block_of_oscillation_has_an_excerpt() -> None:
+    t = np.arange(6001) / 100
+    burst = 40 * np.sin(2 * np.pi * t / 0.8) * (np.abs(t - 40) < 2.8)
+    small = 4 * np.sin(2 * np.pi * t / 0.4) * (np.abs(t - 10) < 2)
+    part = design_figures._fast_part(t, [small, burst])
+    assert part is not None
+    assert 37 < t[part][0] < t[part][-1] < 43
+    assert design_figures._fast_part(t, [40 * np.sin(2 * np.pi * t / 10)]) is None
+
+
+def test_speeds_of_an_arm_are_called_as_its_joints_are() -> None:
+    axes = {ax.get_ylabel(): ax for ax in design(model_of("ur10")).axes}
+    speeds, angles = (
+        [t.get_text() for t in axes[label].get_legend().get_texts()] for label in ("speed [rad/s]", "angle [rad]")
+    )
+    assert speeds == angles
+
+
 TOUCH_PX = 1.0  # by which boxes of texts may overlap: letters don't fill theirs
 
 
@@ -324,7 +342,7 @@ WIDTHS_AND_MACHINES = [
     (88.0, LONG),
     (None, LONG),
     pytest.param(180.0, LONG, marks=pytest.mark.slow),
-    *(pytest.param(88.0, name, marks=pytest.mark.slow) for name in MACHINES),
+    *(pytest.param(width, name, marks=pytest.mark.slow) for width in (88.0, 180.0) for name in MACHINES),
 ]
 
 

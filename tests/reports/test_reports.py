@@ -121,6 +121,23 @@ def test_design_answers_with_what_can_be_known() -> None:
     assert tables[1].rows == (("power", "2.000 % of its range"),)
 
 
+def test_a_design_for_cond_says_the_other_end_in_a_line() -> None:
+    summary = json.loads((RESULTS / "R60_accuracy" / "design" / "summary.json").read_text()) | {"objective": "cond"}
+    assert (
+        "The other end, the drive of `--objective accuracy`, was not looked for." in describe("design", summary).remarks
+    )
+    end = {"cond_phi": 90.0, "worst_parameter": "u20", "worst_percent": 0.87, "median_percent": 0.3}
+    both = {"most_accurate": {**end, "folder": "accurate"}, "lowest_cond": end | {"cond_phi": 17.0}}
+    said = describe("design", summary | both | {"cond_slack_percent": 12.0})
+    line = "u20 to 0.87 % or better at cond(Phi) 90; the folder accurate has it to drive."
+    assert f"The other end, `--objective accuracy` from this drive: {line}" in said.remarks
+    assert [row[0] for row in said.tables[0].rows] == [
+        "lowest cond(Phi), --cond-slack 0",
+        "this drive, the most accurate within 12 %",
+        "for accuracy, --objective accuracy",
+    ]
+
+
 def test_compare_says_which_way() -> None:
     summary = json.loads((RESULTS / "compare_R60" / "summary.json").read_text())
     described = describe("compare", summary | {"ratio_equal_time": 6.8})
@@ -215,7 +232,7 @@ def test_report_in_a_browser_fits_screen_and_paper(browser: Any, tmp_path: Path)
     source = RESULTS / "R60_accuracy" / "verify"
     summary = json.loads((source / "summary.json").read_text())
     (tmp_path / "verify.png").write_bytes((source / "verify.png").read_bytes())
-    pages.write_page(tmp_path, "verify", summary)
+    pages.write_report(tmp_path, "verify", summary)
     for size in ((1000, 800), (390, 844)):
         tab = browser.new_page(viewport={"width": size[0], "height": size[1]})
         said: list[str] = []

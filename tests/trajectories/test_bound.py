@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from support import files
 
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion, simulate
 from excite.trajectories import multisine, objective
 from excite.trajectories.baselines import scale_into_limits
-from excite.trajectories.bound import Bound, _best_mixture, _feasible_samples, _state_space, _violation, bound
+
+study = files.study("bound_R60", "bound")
 
 
 @pytest.fixture(scope="module")
@@ -27,12 +30,12 @@ def drives(straight: Model, problem: Problem) -> list[Motion]:
 
 
 @pytest.fixture(scope="module")
-def loose(straight: Model, problem: Problem, drives: list[Motion]) -> Bound:
-    return bound(straight, problem, drives[:1], degree=0, rounds=40, population=3000, polished=6, gap=0.05)
+def loose(straight: Model, problem: Problem, drives: list[Motion]) -> Any:
+    return study.bound(straight, problem, drives[:1], degree=0, rounds=40, population=3000, polished=6, gap=0.05)
 
 
 @pytest.mark.slow
-def test_the_bound_closes_and_lies_below_every_drive(straight: Model, drives: list[Motion], loose: Bound) -> None:
+def test_the_bound_closes_and_lies_below_every_drive(straight: Model, drives: list[Motion], loose: Any) -> None:
     assert loose.certified > 0.95 * loose.mixture
     assert loose.mixture < min(objective.cond_phi(straight, m) for m in drives)
     assert loose.certified < 23.31  # the best design of S40 that is known
@@ -40,26 +43,26 @@ def test_the_bound_closes_and_lies_below_every_drive(straight: Model, drives: li
 
 @pytest.mark.slow
 def test_what_drives_must_obey_raises_the_bound(
-    straight: Model, problem: Problem, drives: list[Motion], loose: Bound
+    straight: Model, problem: Problem, drives: list[Motion], loose: Any
 ) -> None:
-    tight = bound(straight, problem, drives[:1], degree=1, rounds=40, population=3000, polished=6, gap=0.05)
+    tight = study.bound(straight, problem, drives[:1], degree=1, rounds=40, population=3000, polished=6, gap=0.05)
     assert tight.mixture > 0.99 * loose.certified
     assert tight.certified < 23.31
 
 
 def test_no_sample_of_a_drive_violates_the_certificate_by_more_than_it_says(
-    straight: Model, problem: Problem, drives: list[Motion], loose: Bound
+    straight: Model, problem: Problem, drives: list[Motion], loose: Any
 ) -> None:
     assert loose.certificate is not None
-    states = _state_space(straight, problem, loose.degree)
-    Phi, drift, _ = states.columns(_feasible_samples(states, [drives[0]], 1))
-    assert _violation(Phi, drift, loose.certificate).max(initial=0.0) <= loose.violation * (1 + 1e-9)
+    states = study._state_space(straight, problem, loose.degree)
+    Phi, drift, _ = states.columns(study._feasible_samples(states, [drives[0]], 1))
+    assert study._violation(Phi, drift, loose.certificate).max(initial=0.0) <= loose.violation * (1 + 1e-9)
     assert loose.certified == pytest.approx(np.sqrt(loose.certificate.proven_bound(loose.violation)))
 
 
 def test_the_same_seed_gives_the_same_bound(straight: Model, problem: Problem, drives: list[Motion]) -> None:
     few = {"degree": 1, "rounds": 2, "population": 500, "polished": 2}
-    assert bound(straight, problem, drives[:1], **few) == bound(straight, problem, drives[:1], **few)
+    assert study.bound(straight, problem, drives[:1], **few) == study.bound(straight, problem, drives[:1], **few)
 
 
 def test_mixture_and_certificate_agree() -> None:
@@ -67,7 +70,7 @@ def test_mixture_and_certificate_agree() -> None:
     rows = rng.standard_normal((40, 2, 4)) * [1.0, 2.0, 3.0, 10.0]
     A = np.einsum("kri,krj->kij", rows, rows)
     c = rng.standard_normal((40, 2))
-    t, w, x = _best_mixture(A, c)
+    t, w, x = study._best_mixture(A, c)
     mixed = np.einsum("k,kij->ij", w, A)
     assert np.linalg.cond(mixed) == pytest.approx(t, rel=1e-4)
     assert np.abs(w @ c).max() < 1e-4 * w.sum()
@@ -85,8 +88,8 @@ def test_a_violated_certificate_still_proves_something() -> None:
     rows = rng.standard_normal((60, 2, 3)) * [1.0, 2.0, 5.0]
     A = np.einsum("kri,krj->kij", rows, rows)
     none = np.zeros((60, 0))
-    t, _, _ = _best_mixture(A, none)
-    few, _, x = _best_mixture(A[:12], none[:12])
+    t, _, _ = study._best_mixture(A, none)
+    few, _, x = study._best_mixture(A[:12], none[:12])
     e = float((np.einsum("kij,ij->k", A, x.U - x.V) / np.einsum("kij,ij->k", A, x.gauge)).max())
     assert e > 0
     assert x.proven_bound(e) <= t <= few
@@ -95,4 +98,4 @@ def test_a_violated_certificate_still_proves_something() -> None:
 def test_a_drive_outside_the_limits_is_refused(straight: Model, problem: Problem, drives: list[Motion]) -> None:
     wild = replace(drives[0], nu=drives[0].nu + 100.0)
     with pytest.raises(ValueError, match="keep the limits nowhere"):
-        bound(straight, problem, [wild])
+        study.bound(straight, problem, [wild])

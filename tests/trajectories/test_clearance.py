@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,11 @@ import pytest
 from excite import trajectories
 from excite.errors import MachineError
 from excite.model import Model, build
-from excite.model.machine import Box, Problem, Quantity, Shape, Tool, load_machine
+from excite.model.machine import Box, Machine, Problem, Quantity, Shape, Tool, load_machine
 from excite.trajectories import JointMotion, clearance, joint_motion, joint_search
 from excite.workflows import DesignRequest, choose_problem, design_from
 
+MACHINES = Path(__file__).parents[2] / "model" / "machines"
 ARM = Path(__file__).parents[1] / "support" / "two_joints.toml"
 HZ = 1000
 
@@ -216,3 +218,77 @@ def test_world_and_tool_are_checked() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             type(load_machine("ur10")).model_validate({**tables, **change})
+
+
+# ------------------------------------------------------------------------------------------------ shipped arms
+
+
+def capsule_gaps(file: Path, q: np.ndarray) -> dict[tuple[str, str], np.ndarray]:
+    """Gap (N,) [m] of any two capsules of different bodies and of the floor along poses q (N, n), from the file alone.
+
+    Points every 5 mm of one capsule's axis, their exact distance from the other's; places of links by the table.
+    """
+    tables = tomllib.loads(file.read_text())
+    angles = {"pi": np.pi, "pi/2": np.pi / 2, "-pi/2": -np.pi / 2}
+
+    def number(x: dict[str, Any]) -> float:
+        return float(angles.get(x["value"], x["value"]))
+
+    def pieces(owner: str, shapes: list[Any], R: np.ndarray, P: np.ndarray) -> list[Any]:
+        ends = [np.array(s["ends"], float) @ R.transpose(0, 2, 1) + P[:, None] for s in shapes]
+        return [(f"{owner} {k}", e, number(s["radius"])) for k, (e, s) in enumerate(zip(ends, shapes, strict=True))]
+
+    R, P = np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3))
+    placed = pieces("ground", tables["world"]["shape"], R, P)
+    for body, angle in zip(tables["body"], q.T, strict=True):
+        a, turn = number(body["alpha"]), angle + number(body.get("theta", {"value": 0}))
+        tilt = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+        P = P + R @ (np.array([number(body["d"]), 0, 0]) + tilt @ [0, 0, number(body["r"])])
+        c, s, o = np.cos(turn), np.sin(turn), 0 * turn
+        R = R @ tilt @ np.stack([c, -s, o, s, c, o, o, o, o + 1], axis=1).reshape(-1, 3, 3)
+        placed += pieces(body["name"], body["shape"], R, P)
+    gaps: dict[tuple[str, str], np.ndarray] = {}
+    for k, (one, ends, radius) in enumerate(placed):
+        length = np.linalg.norm(ends[0, -1] - ends[0, 0])
+        points = ends[:, :1] + np.linspace(0, 1, 2 + int(length / 0.005))[:, None] * (ends[:, -1:] - ends[:, :1])
+        gaps[one, "floor"] = points[..., 2].min(axis=1) - radius
+        for other, far, other_radius in placed[k + 1 :]:
+            if one.split()[0] != other.split()[0]:
+                along = far[:, -1:] - far[:, :1]
+                share = ((points - far[:, :1]) * along).sum(axis=2) / np.maximum((along**2).sum(axis=2), 1e-12)
+                away = points - far[:, :1] - np.clip(share, 0, 1)[..., None] * along
+                gaps[one, other] = np.linalg.norm(away, axis=2).min(axis=1) - radius - other_radius
+    return gaps
+
+
+def least_gap(machine: Machine, q: np.ndarray) -> tuple[float, tuple[str, str]]:
+    """Least gap [m] along poses q, of pairs that move and keep the margin in a tenth of random poses; and whose."""
+    ends = np.array([b.limit.drive_range or (-np.pi, np.pi) for b in machine.body])
+    anywhere = np.random.default_rng(9).uniform(ends[:, 0], ends[:, 1], (3000, len(ends)))
+    file = MACHINES / f"{machine.name}.toml"
+    usual = capsule_gaps(file, anywhere)
+    counted = [p for p, g in usual.items() if np.ptp(g) > 1e-9 and (g < 0.02).mean() < 0.9]
+    gaps = capsule_gaps(file, q)
+    return min((float(gaps[p].min()), p) for p in counted)
+
+
+def test_the_checker_sees_an_arm_that_folds_or_dips() -> None:
+    machine = load_machine("ur10")
+    assert least_gap(machine, np.array([[0, -1.0, 3.13, 0, 0, 0]]))[1][0].split()[0] == "shoulder"
+    gap, pair = least_gap(machine, np.array([[0, 1.5, 0, 0, 0, 0]]))
+    assert gap < -0.9
+    assert pair[1] == "floor"
+    assert least_gap(machine, np.array([[0, -np.pi / 2, 0, 0, 0, 0]]))[0] > 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "seed"), [("ur10", 0), ("ur10", 1), ("ur10e", 0), ("panda", 0)])
+def test_shipped_arms_touch_nothing_at_a_kilohertz(name: str, seed: int) -> None:
+    model = build(load_machine(name))
+    _, problem = choose_problem(model.machine, None, None)
+    request = DesignRequest(starts=1, seed=seed, trajectory="fourier", cond_slack=0.0)
+    found = design_from(model, problem, request).design
+    assert found.max_violation <= joint_search.ROUNDING
+    motion = trajectories.planned_motion(model, found.motion.t, found.motion.q).at(HZ)
+    gap, pair = least_gap(model.machine, motion.q)
+    assert gap > 0.0195, pair

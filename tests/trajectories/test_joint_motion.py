@@ -106,6 +106,52 @@ def test_derivatives_are_exact(arm: Model, problem: Problem, kind: str, objectiv
     assert moved == pytest.approx(differences(program.slack, x, d), abs=1e-5 * np.abs(moved).max())
 
 
+def test_bounds_are_lowered_beside_what_the_program_does_not_see(arm: Model, problem: Problem) -> None:
+    """One point between two samples exceeds a rate by 2 % of its range, though the program sees half the limit."""
+    aim = trajectories.compose_objective(arm, "cond")
+    program = MotionProgram(joint_motion.with_smooth_friction(arm), problem, aim, basis_of(arm, problem, "free"))
+    x = 0.02 * np.random.default_rng(3).normal(size=program.size)
+    free, values = program.slack(x), program.limit_values(x)
+    k = next(k for k, g in enumerate(program.limits) if g.kind == "rate")
+    t = np.linspace(0, 4.0, 8001)
+    excess = {g.name: np.zeros(len(t)) for g in program.limits}
+    at = int(np.argmin(np.abs(t - 1.01)))
+    place = 1.01 / 4.0 * (len(values) - 1)
+    beside = int(np.floor(place)), int(np.ceil(place))
+    side = int(values[beside[0], k] < 0)
+    excess[program.limits[k].name][at] = -0.02 if side else 0.02
+    program.widen_margins(x, t, excess)
+    changed = np.argwhere(program.margins != joint_motion.FIRST_MARGIN)
+    assert [tuple(c) for c in changed] == [(side, n, k) for n in beside]
+    slack, row = program.slack(x), side * program.n_g + k
+    assert slack[row] == pytest.approx(-1.2 * 0.04 - joint_motion.FIRST_MARGIN)
+    assert np.delete(slack, row) == pytest.approx(np.delete(free, row))
+    d = np.random.default_rng(4).normal(size=program.size)
+    x = x + 1e-3 * d  # both samples beside the point are equally far from their bounds at x
+    moved = program.slack_jacobian(x) @ d
+    assert moved == pytest.approx(differences(program.slack, x, d), abs=1e-5 * np.abs(moved).max())
+
+
+def test_a_solve_that_cannot_keep_the_limits_ends_where_it_came_nearest(
+    arm: Model, problem: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The search passes three motions of growing size, the last one by far outside."""
+    aim = trajectories.compose_objective(arm, "cond")
+    program = MotionProgram(joint_motion.with_smooth_friction(arm), problem, aim, basis_of(arm, problem, "free"))
+    direction = np.random.default_rng(5).normal(size=program.size)
+    passed = [size * direction for size in (0.5, 0.2, 2.0)]
+    program.margins[:] = 1.2  # on both sides: no motion keeps them
+
+    def pass_by(*_: object, callback: Callable[[np.ndarray], None], **__: object) -> None:
+        for x in passed:
+            callback(x)
+
+    monkeypatch.setattr(joint_motion, "minimize", pass_by)
+    found = program.solve(passed[0], lambda: False, 25)
+    assert found.x == pytest.approx(passed[1])
+    assert found.last == pytest.approx(passed[2])
+
+
 @pytest.mark.parametrize(("kind", "most"), [("fourier", 26.0), ("free", 25.0)])
 def test_design_of_two_joints_reaches_a_figure(arm: Model, problem: Problem, kind: str, most: float) -> None:
     """Measured 25.4 and 23.6; the best of 200 random series has 64."""
@@ -271,6 +317,18 @@ def test_a_drive_without_rest_begins_with_room_where_zero_ends_a_range(tmp_path:
     model, _, problem = prepare_design(str(tmp_path / "onesided.toml"), None, None, DesignRequest())
     assert joint_search.end_poses(model, problem)[0][0] == pytest.approx(1.45 / 2)
     assert len(joint_search.free_poses(model, problem)) > 10
+
+
+def test_guesses_move_joints_that_start_at_the_end_of_their_range(arm: Model, problem: Problem) -> None:
+    """However little room is left there: without any motion there is no condition number to begin with."""
+    ends = dict(zip(arm.coordinates, joint_search.drive_ranges(arm)[1], strict=True))
+    at_ends = problem.model_copy(update={"start_pose": ends, "end_pose": ends})
+    aim = trajectories.compose_objective(arm, "cond")
+    basis = joint_motion.motion_basis(arm, at_ends, "fourier", *joint_search.end_poses(arm, at_ends))
+    program = joint_motion.MotionProgram(arm, at_ends, aim, basis)
+    x = joint_search.best_guess(program, joint_search.end_poses(arm, at_ends)[:1], 0, lambda: False)
+    motion = joint_motion.JointMotion(basis, program.coefficients(x)).sample(arm)
+    assert (np.ptp(motion.q, axis=0) > 1e-3).all()
 
 
 def _weaker(body: Body) -> Body:

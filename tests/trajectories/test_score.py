@@ -128,7 +128,7 @@ def test_the_folder_of_a_drive_is_taken_as_the_drive(
     file = read_drive(folder / "profile.csv", straight)
     np.testing.assert_array_equal(read_drive(folder, straight).torque, file.torque)
     assert is_profile(folder, straight)
-    usual, own = read_rivals("--against", ["chirp", str(folder)], straight, straight.machine.problems["S40"])
+    usual, own = read_rivals(["chirp", str(folder)], straight, straight.machine.problems["S40"])
     assert (usual, list(own)) == (("chirp",), ["drive-1"])
     assert contrasts(straight, DesignRequest("prediction", of=folder)) is not None
     assert excite("score", "va12_straight", folder, "--out", "s")[0] == 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import sys
 import tomllib
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from excite.model.mechanics import body_poses
 from excite.trajectories import machine_limits
 from excite.workflows import choose_problem
 from excite.workflows.collision_shapes import capsules_around
+from excite.workflows.urdf import read_robot
 
 ARM = Path(__file__).parents[1] / "support" / "arm.urdf"
 SHAPES = {  # collision geometry by link
@@ -104,6 +107,62 @@ def test_a_mesh_that_is_missing_is_said_in_the_file(tmp_path: Path) -> None:
     urdf.write_text(text[:start] + mesh + text[start:])
     machine_template.start("arm", file, origin=str(urdf))
     assert "the collision mesh package://robots/nothing.stl is not there" in file.read_text()
+    assert not any(b.shape for b in load_machine(file).body)
+
+
+def with_collision(geometry: str, folder: Path) -> tuple[Path, Path]:
+    """URDF of the arm with a collision geometry of its upper arm, and the place of its machine file."""
+    text = ARM.read_text()
+    start = text.index(">", text.index('<link name="Upper-Arm"')) + 1
+    urdf = folder / "arm.urdf"
+    urdf.write_text(f"{text[:start]}<collision><geometry>{geometry}</geometry></collision>{text[start:]}")
+    return urdf, folder / "arm.toml"
+
+
+@pytest.mark.parametrize("kind", ["box", "cylinder", "sphere"])
+def test_plain_geometry_needs_no_mesh_library(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Points all over the true surface lie in the capsules, to the digits of the file."""
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    rng = np.random.default_rng(0)
+    n = rng.normal(size=(4000, 3))
+    round_, z = n / np.linalg.norm(n, axis=1, keepdims=True), rng.uniform(-0.2, 0.2, (4000, 1))
+    if kind == "box":
+        tag, surface = '<box size="0.1 0.3 0.05"/>', np.clip(n, -1, 1) * [0.05, 0.15, 0.025]
+    elif kind == "cylinder":
+        tag = '<cylinder radius="0.07" length="0.4"/>'
+        surface = np.hstack([0.07 * n[:, :2] / np.linalg.norm(n[:, :2], axis=1, keepdims=True), z])
+    else:
+        tag, surface = '<sphere radius="0.12"/>', 0.12 * round_
+    urdf, file = with_collision(tag, tmp_path)
+    machine_template.start("arm", file, origin=str(urdf))
+    (shapes,) = (b.shape for b in load_machine(file).body if b.shape)
+    joint = next(f for f in read_robot(urdf).attached if any(link == "Upper-Arm" for link, _ in f))
+    at = next(placed for link, placed in joint if link == "Upper-Arm")
+    depth = inside(surface @ at[:3, :3].T + at[:3, 3], [(np.array(s.ends), float(s.radius)) for s in shapes])
+    assert depth.min() > -1e-4
+    assert sum(float(s.radius) for s in shapes) < {"box": 0.5, "cylinder": 0.3, "sphere": 0.13}[kind]
+
+
+@pytest.mark.parametrize(
+    ("geometry", "said"),
+    [
+        (
+            '<mesh filename="arm.stl"/>',
+            r"the mesh arm.stl is read with trimesh: pip install 'excite\[urdf\]'",
+        ),
+        ('<box size="0.1 0.3"/>', "link Upper-Arm, collision geometry box: size must be three lengths"),
+        ('<sphere radius="-1"/>', "link Upper-Arm, collision geometry sphere: a length must be > 0"),
+        ("<cone/>", "link Upper-Arm, collision geometry cone: is unknown, known are box, cylinder, sphere and mesh"),
+    ],
+)
+def test_geometry_that_cannot_be_read_is_named(
+    geometry: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    (tmp_path / "arm.stl").write_text("solid")
+    urdf, file = with_collision(geometry, tmp_path)
+    machine_template.start("arm", file, origin=str(urdf))
+    assert re.search(said, file.read_text())
     assert not any(b.shape for b in load_machine(file).body)
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +18,9 @@ from excite.model import Model, build
 from excite.model.machine import load_machine
 from excite.simulation import Motion, sensors
 from excite.smoothing import cramer_rao
-from excite.trajectories import saved_design
-from excite.workflows import DesignRequest
-from excite.workflows.design_request import POOR_PERCENT, advice
+from excite.trajectories import CompositeObjective, Design, compose_objective, saved_design
+from excite.workflows import DesignRequest, design_request
+from excite.workflows.design_request import POOR_PERCENT, DesignResult, advice
 
 
 def test_advice_names_what_to_do() -> None:
@@ -169,3 +171,49 @@ def test_an_accuracy_must_be_positive(excite: Excite) -> None:
     code, _, err = excite("design", "va12_straight", "--sigma-max", 0)
     assert code == 2
     assert "--sigma-max: must be > 0 %" in err
+
+
+def drive(cond: float, worst: float, **more: Any) -> Design:
+    """A design whose drive is its name for `ends`: cond(Phi) and the worst parameter [%]."""
+    return Design("cond", (cond, worst), None, cond, cond, 99.0, {}, 0.0, (cond,), True, **more)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def ends(monkeypatch: pytest.MonkeyPatch, straight: Model) -> Callable[..., tuple[DesignResult, list[Any]]]:
+    """The second step of a design, from the searches' answers by what they are bounded by; and the searches made."""
+    monkeypatch.setattr(design_request._NearSearch, "worst", lambda self, made: made[1])
+
+    def make(answers: dict[str, Design], **more: Any) -> tuple[DesignResult, list[Any]]:
+        made = []
+
+        def search(model: Model, problem: Any, aim: CompositeObjective, *args: Any) -> Design:
+            made.append((aim.name, aim.sigma_max, args[4]))
+            return answers[aim.name]
+
+        monkeypatch.setattr(design_request, "design_drive", search)
+        lowest = drive(20.0, 8.0, random=((200.0, 3.0),), **more)
+        near = design_request._NearSearch(straight, None, DesignRequest(), None, None, None, lowest.stopped)  # type: ignore[arg-type]
+        return design_request._make_accurate(near, compose_objective(straight, "cond"), lowest), made
+
+    return make
+
+
+def test_the_drive_near_the_lowest_cond_is_taken_if_no_random_start_is_more_accurate(ends: Any) -> None:
+    found, made = ends({"worst": drive(22.0, 2.0), "accuracy": drive(90.0, 0.9)})
+    assert (found.design.cond_phi, found.first.cond_phi, found.accurate.cond_phi) == (22.0, 20.0, 90.0)
+    assert [name for name, _, _ in made] == ["worst", "accuracy"]
+
+
+def test_cond_grows_as_far_as_it_takes_to_beat_the_best_random_start(ends: Any) -> None:
+    """From the drive for accuracy, which is as accurate already: so there is an answer."""
+    found, made = ends({"worst": drive(22.0, 4.0), "accuracy": drive(90.0, 0.9), "cond": drive(35.0, 2.9)})
+    assert found.design.cond_phi == 35.0
+    assert made[-1] == ("cond", 3.0, [(22.0, 4.0), (90.0, 0.9)])
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_no_search_begins_after_ctrl_c(ends: Any, first: bool) -> None:
+    found, made = ends({"worst": drive(22.0, 4.0, stopped=True)}, stopped=first)
+    assert [name for name, _, _ in made] == ([] if first else ["worst"])
+    assert found.design.cond_phi == (20.0 if first else 22.0)
+    assert not found.design.complete

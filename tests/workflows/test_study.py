@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import re
@@ -13,7 +14,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,10 +30,10 @@ from excite.model import Model, build
 from excite.model.effects import placing
 from excite.model.machine import Problem, machine as machines
 from excite.reports import describe
-from excite.reports.pages import write_page
+from excite.reports.pages import write_report
 from excite.simulation import Motion, simulate
 from excite.trajectories import saved_design
-from excite.workflows import executors, row_store, study_plan, study_runner, study_runs
+from excite.workflows import row_store, study_plan, study_runner, study_runs, study_workers
 from excite.workflows.study_plan import StudyPlan
 
 ROOT = Path(__file__).parents[2]
@@ -288,7 +288,7 @@ def test_the_page_says_which_cell_is_best_and_what_made_it(tmp_path: Path) -> No
     said = {"done": 20, "failed": 0, "runs": 20, "defects": 0, "steps": ["verify"], "compute_s": 1.0}
     said |= {"cells": cells, "program": "0123456789abcdef", "versions": {"excite": "0"}}
     (tmp_path / "study.png").touch()
-    write_page(tmp_path, "study", said)
+    write_report(tmp_path, "study", said)
     text = (tmp_path / "report.html").read_text()
     assert "cond, 20 s (Ky1 0.81 % rms) is the best of 3 cells, cond, 40 s (u20 170 % rms) the worst." in text
     assert "0123456789abcdef" in text
@@ -422,9 +422,9 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     seen: list[int] = []
     plain = study_runs.run_once
 
-    def run(work: study_runs.RunBatch, seed: int) -> study_runs.Row:
-        seen.append(seed)
-        return plain(work, seed)
+    def run(one: study_runs.Run) -> study_runs.RunOutcome:
+        seen.append(one.seed)
+        return plain(one)
 
     monkeypatch.setattr(study_runs, "run_once", run)
     return seen
@@ -482,11 +482,12 @@ def test_two_can_not_work_on_one_study(tmp_path: Path) -> None:
 
 def test_rows_are_kept_once_and_whole(tmp_path: Path) -> None:
     with row_store.open_store(tmp_path / "s", "f") as kept:
-        kept.add_rows([(3, {"a": 1.5}), (1, {"a": None})])
-        with pytest.raises(ValueError, match="stored already"):
-            kept.add_rows([(2, {}), (3, {})])
+        kept.add(3, {"a": 1.5})
+        kept.add(1, {"a": None})
+        with pytest.raises(sqlite3.IntegrityError, match="UNIQUE"):
+            kept.add(3, {})
         with pytest.raises(ValueError, match="not JSON compliant"):
-            kept.add_rows([(4, {}), (5, {"a": float("nan")})])
+            kept.add(5, {"a": float("nan")})
     with row_store.open_store(tmp_path / "s", "f") as kept:
         assert list(kept.rows()) == [(1, {"a": None}), (3, {"a": 1.5})]
 
@@ -499,13 +500,40 @@ def test_a_damaged_store_is_not_read(tmp_path: Path) -> None:
 
 def test_a_full_disk_loses_nothing(tmp_path: Path) -> None:
     with row_store.open_store(tmp_path / "s", "f") as kept:
-        kept.add_rows([(k, {"a": k}) for k in range(10)])
+        for k in range(10):
+            kept.add(k, {"a": k})
+        kept.commit()
         kept._db.execute(f"PRAGMA max_page_count = {kept._db.execute('PRAGMA page_count').fetchone()[0] + 2}")
+
+        def fill() -> None:
+            for k in range(10, 200):
+                kept.add(k, {"text": "x" * 500})
+
         with pytest.raises(RowStoreError, match=r"full.*repeat the command"):
-            kept.add_rows([(k, {"text": "x" * 500}) for k in range(10, 200)])
+            fill()
     with row_store.open_store(tmp_path / "s", "f") as kept:
-        assert kept.numbers() == set(range(10))
-        kept.add_rows([(k, {}) for k in range(10, 200)])
+        there = kept.numbers()
+        assert there == set(range(max(10, len(there))))  # whole rows, none left out
+        for k in set(range(200)) - there:
+            kept.add(k, {})
+
+
+def test_a_store_that_cannot_begin_says_what_to_do(tmp_path: Path) -> None:
+    code = f"""
+import resource
+from pathlib import Path
+from excite.errors import RowStoreError
+from excite.workflows import row_store
+resource.setrlimit(resource.RLIMIT_FSIZE, (2048, 2048))
+try:
+    with row_store.open_store(Path({str(tmp_path / "s")!r}), "f"):
+        pass
+except RowStoreError as err:
+    print(err)
+"""
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "is the disk full" in said
+    assert "repeat the command" in said
 
 
 @pytest.mark.slow
@@ -519,48 +547,38 @@ def test_a_worker_that_dies_costs_nothing_and_a_deadly_piece_is_found(tmp_path: 
             os.kill(os.getpid(), signal.SIGKILL)
         return number
 
-    with executors.open_pool(2) as workers:
-        results = list(executors.run_pieces(dies, range(8), workers))
-        [chance] = executors.run_pieces(dies, [9], workers)
-    assert sorted(r.piece for r in results) == list(range(8))
-    assert {r.piece for r in results if r.value is None} == {3}
-    assert chance.value == 9, "workers that were killed twice from outside are not the fault of what they had alone"
+    results = dict(study_workers.compute(dies, range(8), jobs=2))
+    chance = dict(study_workers.compute(dies, [9], jobs=2))
+    assert results == {k: None if k == 3 else k for k in range(8)}
+    assert chance == {9: 9}, "workers that were killed twice from outside are not the fault of what they had alone"
 
 
-def test_a_batch_that_dies_is_no_fault_of_its_runs() -> None:
-    """Two runs whose batch kills its worker, and each of them alone as often as may be by chance."""
-    deaths: dict[tuple[int, ...], int] = {}
-
-    class Dying(executors.ThisProcess):
-        shared = True
-
-        def died(self, err: BaseException) -> bool:
-            return isinstance(err, BrokenExecutor)
-
-    def dies(batch: tuple[int, ...]) -> int:
-        deaths[batch] = deaths.get(batch, 0) + 1
-        if len(batch) > 1 or deaths[batch] < executors.MAX_DEATHS:
-            raise BrokenExecutor
-        return sum(batch)
-
-    results = executors.run_pieces(dies, [(1, 2)], Dying(), lambda batch: [(k,) for k in batch])
-    assert {r.piece: r.value for r in results} == {(1,): 1, (2,): 2}
-    assert deaths == {(1, 2): 1, (1,): executors.MAX_DEATHS, (2,): executors.MAX_DEATHS}
-
-
-def test_pieces_are_taken_as_they_are_needed() -> None:
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_tasks_are_taken_as_they_are_needed(jobs: int) -> None:
     taken: list[int] = []
 
-    def pieces() -> Any:
-        for k in range(50):
+    def tasks() -> Iterator[int]:
+        for k in range(2000):
             taken.append(k)
             yield k
 
-    ahead = 0
-    with executors.open_pool(1) as workers:
-        for k, _ in enumerate(executors.run_pieces(abs, pieces(), workers)):
-            ahead = max(ahead, len(taken) - k)
-    assert ahead <= executors.PIECES_PER_WORKER + 1
+    results = study_workers.compute(abs, tasks(), jobs)
+    for _ in range(10):
+        next(results)
+    results.close()
+    assert len(taken) < 100 * jobs
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_what_goes_wrong_in_a_task_or_in_taking_one_is_raised(jobs: int) -> None:
+    def tasks() -> Iterator[int]:
+        yield from range(20)
+        raise FolderError("no drive is left")
+
+    with pytest.raises(FolderError, match="no drive is left"):
+        list(study_workers.compute(abs, tasks(), jobs))
+    with pytest.raises(TypeError, match="bad operand"):
+        list(study_workers.compute(abs, iter("ab"), jobs))  # type: ignore[arg-type]
 
 
 def test_no_cluster_is_said_in_a_line(tiny: Callable[..., StudyPlan], tmp_path: Path, excite: Excite) -> None:
@@ -635,13 +653,12 @@ file, out, seed, kills = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]),
 rng = random.Random(seed)
 plain = study_runs.run_once
 
-def logged(work, s):
-    row = plain(work, s)
-    number = next(n for n, other in work.runs if other == s)
+def logged(run):
+    outcome = plain(run)
     handle = os.open("computed", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    os.write(handle, f"{number}\\n".encode())
+    os.write(handle, f"{run.number}\\n".encode())
     os.close(handle)
-    return row
+    return outcome
 
 study_runs.run_once = logged
 
@@ -765,7 +782,7 @@ def test_a_full_file_system_is_said_and_the_study_goes_on_after(
 SAME = ("runs.parquet", "study.json", "study.png")  # the report and the summary say how long it took as well
 
 
-RUNS = 150
+RUNS = 60
 
 
 class Command:
@@ -833,6 +850,41 @@ def carried(whole: Command, tmp_path: Path, snapshot: dict[str, str]) -> Iterato
     for one in running:
         one.run.kill()
         one.run.wait()
+
+
+def workers_of(driver: int) -> list[int]:
+    """The processes that compute for a driver, the oldest first."""
+    children = Path(f"/proc/{driver}/task/{driver}/children").read_text().split()
+    return [int(p) for p in children if b"LokyProcess" in Path(f"/proc/{p}/cmdline").read_bytes()]
+
+
+@pytest.mark.slow
+def test_killed_workers_of_this_computer_cost_nothing(whole: Command, carried: Callable[..., Command]) -> None:
+    """A worker is killed (-9) under way, later another one."""
+    struck = carried("--jobs", "2")
+    kept = struck.midway(RUNS // 10)
+    os.kill(workers_of(struck.run.pid)[0], signal.SIGKILL)
+    struck.midway(kept + RUNS // 10)
+    os.kill(workers_of(struck.run.pid)[0], signal.SIGKILL)
+    struck.said()
+    struck.same_as(whole)
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_what_is_done(whole: Command, carried: Callable[..., Command]) -> None:
+    """Interrupt of the driver and its workers, as a terminal sends it; then the same command goes on."""
+    first = carried("--jobs", "2")
+    kept = first.midway(RUNS // 10)
+    for process in (*workers_of(first.run.pid), first.run.pid):
+        os.kill(process, signal.SIGINT)
+    said = first.said(130)
+    assert "the same command resumes" in said
+    assert "Warning" not in said
+    second = carried("--jobs", "2")
+    found = re.search(rf"running: (\d+) of {RUNS}", second.said())
+    assert found
+    assert kept <= int(found[1]) < RUNS
+    second.same_as(whole)
 
 
 class Dask:
@@ -923,19 +975,26 @@ def test_a_killed_scheduler_is_said_and_the_study_goes_on(
 def test_a_scheduler_that_is_gone_is_said_whatever_is_asked(dask: Dask) -> None:
     """While the client still tries to reach it, and after it gave up."""
     dask.worker()
-    with executors.open_pool(cluster=dask.address) as workers:
-        assert workers.size == 1
-        assert workers.submit(abs, -1).result(timeout=60) == 1
+    for wait in (0, 5):
+        results = study_workers.compute(abs, itertools.count(), cluster=dask.address)
+        assert next(results) == (0, 0)
         dask.close()
-        for _ in range(2):
-            with pytest.raises(WorkerError, match="repeat the command"):
-                assert workers.size
-        time.sleep(5)
+        time.sleep(wait)
         with pytest.raises(WorkerError, match="repeat the command"):
-            workers.submit(abs, -1)
+            for _ in results:
+                pass
+        dask.scheduler()
+        dask.worker()
 
 
-def workers_of(driver: int) -> list[int]:
-    """The processes that compute for a driver, the oldest first."""
-    children = Path(f"/proc/{driver}/task/{driver}/children").read_text().split()
-    return [int(p) for p in children if b"LokyProcess" in Path(f"/proc/{p}/cmdline").read_bytes()]
+@pytest.mark.slow
+def test_a_deadly_task_is_found_on_a_cluster(dask: Dask, tmp_path: Path) -> None:
+    def dies(number: int) -> int:
+        if number == 7:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return number
+
+    for _ in range(10):
+        dask.worker()
+    results = dict(study_workers.compute(dies, range(20), cluster=dask.address))
+    assert results == {k: None if k == 7 else k for k in range(20)}

@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations_with_replacement
+from typing import Any
 
 import casadi as ca
 import cvxpy as cp
@@ -259,7 +260,13 @@ def _state_space(model: Model, problem: Problem, degree: int) -> _StateSpace:
     G, B, m = ca.SX.sym("G", n, n), ca.SX.sym("B", n, n), ca.SX.sym("m", drift.numel())
     gain, gauge = (ca.sum1(ca.sum2((phi @ X) * phi)) for X in (G, B))
     search = {"x": z, "p": ca.vertcat(ca.vec(G), ca.vec(B), m), "f": -(gain - ca.dot(m, drift)) / gauge, "g": g}
-    quiet = {"print_level": 0, "sb": "yes", "max_iter": 60, "tol": 1e-5, "hessian_approximation": "limited-memory"}
+    quiet: dict[str, Any] = {
+        "print_level": 0,
+        "sb": "yes",
+        "max_iter": 60,
+        "tol": 1e-5,
+        "hessian_approximation": "limited-memory",
+    }
     polish = ca.nlpsol("polish", "ipopt", search, {"print_time": False, "error_on_fail": False, "ipopt": quiet})
     sample = ca.Function("sample", [z], [phi.T, drift, g], {"cse": True})
     return _StateSpace(core, np.array(size), n, len(model.inputs), sample, low, high, polish)
