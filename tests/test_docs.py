@@ -184,7 +184,7 @@ def test_tutorial_runs_as_it_is_written(tmp_path: Path, monkeypatch: pytest.Monk
         if language == "python":
             exec(compile(text, "tutorial.md", "exec"), names)
         else:
-            subprocess.run(["bash", "-c", shell + text], check=True, env=ENVIRONMENT, timeout=600)
+            subprocess.run(["bash", "-c", shell + text], check=True, env=ENVIRONMENT, timeout=1800)
     assert not fewer
     files = "design/report.html cab/sheet.pdf cab/driver.html checked/log.png found/report.html my_logger.toml"
     for written in (
@@ -370,7 +370,7 @@ def test_progress_does_not_spoil_what_is_piped(tmp_path: Path) -> None:
         os.close(slave)
         reader = threading.Thread(target=drain, daemon=True)
         reader.start()
-        stdout, _ = run.communicate(timeout=120)
+        stdout, _ = run.communicate(timeout=600)
         reader.join(5)
     os.close(master)
     assert run.returncode == 0

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "docs" / "notebooks").glob("*.ipynb"))
-MAX_S = 120.0  # for one notebook; it takes 30 s on two quiet cores
+HANGS_S = 1200  # after which a cell has come to a stop; a notebook takes 30 s on two quiet cores
 SAYS = {
     "test_day": ("11 parameters are identified", "torque deadband (rear roll)", "intervals hold the truth"),
     "compare_designs": ("worst parameter [%]", "Score of the drive"),
@@ -34,9 +33,7 @@ def test_a_notebook_runs(path: Path, tmp_path: Path) -> None:
     nbformat = pytest.importorskip("nbformat")
     pytest.importorskip("ipykernel")
     notebook: Any = nbformat.read(path, as_version=4)
-    begin = time.perf_counter()
-    nbclient.NotebookClient(notebook, timeout=MAX_S, resources={"metadata": {"path": str(tmp_path)}}).execute()
-    assert time.perf_counter() - begin < MAX_S
+    nbclient.NotebookClient(notebook, timeout=HANGS_S, resources={"metadata": {"path": str(tmp_path)}}).execute()
     shown = [out for cell in notebook.cells if cell.cell_type == "code" for out in cell.outputs]
     said = "".join(str(out.get("data", {}).get("text/plain", "")) + str(out.get("text", "")) for out in shown)
     for words in SAYS[path.stem]:

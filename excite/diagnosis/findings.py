@@ -160,7 +160,8 @@ def explain(
 ) -> Assessment:
     """Diagnose logs by joint smoothing, or by regression on the torques where all joints are driven and rigid.
 
-    Where these torques are explained, joint smoothing says what shows near rest alone, if it can follow the motion.
+    Where these torques are explained, joint smoothing says what shows near rest alone, if it can follow the motion with
+    exact dynamics; what it then leaves unexplained is said.
     Several logs are compared first: if each alone is explained and they differ in parameters, that is the answer.
     budget_s [s]: after it, and after a first Ctrl-C, nothing new is begun, and the best answer so far is given. Raises
     NoEstimateError.
@@ -206,7 +207,7 @@ def _find_differences(model: Model, logs: Sequence[Log], filter: Filter) -> Agre
         every = [x for x in alone if x is not None]
         agreement = identification.compare_logs(tuple(groups), every) if len(every) == len(groups) else None
         return None if agreement is None or agreement.agree else agreement
-    agreement, estimates = identification.compare_sources(model, logs, "joint", filter)
+    agreement, estimates, _ = identification.compare_sources(model, logs, "joint", filter)
     if agreement is None or agreement.agree or any(e.status != "valid" for e in estimates):
         return None
     return agreement
@@ -238,7 +239,9 @@ def _explain(
         if torques is None:
             raise
         return torques
-    return every if torques is None or every.diagnosis.verdict in ("named", "tied") else torques
+    d = every.diagnosis
+    told = d.verdict in ("named", "tied") or (d.verdict == "unexplained" and d.exact[0])
+    return every if torques is None or told else torques
 
 
 def assess_torques(d: TorqueDiagnosis, errors: Sequence[HoldOutErrors]) -> Assessment:

@@ -21,6 +21,8 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol, TypeVar
 
+import joblib
+
 R = TypeVar("R")
 
 PR_SET_PDEATHSIG = 1  # from <linux/prctl.h>: signal that a process gets when its parent ends
@@ -38,8 +40,8 @@ class CallRunner(Protocol):
 
 
 def usable_cores() -> int:
-    """Return the number of processes that pay; one where forking is not sound."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else 1
+    """Return the number of processes that pay, also in a container with a quota; one where forking is not sound."""
+    return joblib.cpu_count() if sys.platform == "linux" else 1
 
 
 def run_in_turn(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:

@@ -175,9 +175,9 @@ def _alternatives(form: evidence.Form, found: Chosen) -> list[EffectEntry]:
         for j in own:
             if gains[j] > best - RIVAL_LOSS and form.candidates[j] is not x:
                 both = [*rest, form.candidates[j]]
-                alternatives.append(
-                    _start_entry(form.candidates[j], evidence.posterior(form, both, logs, 0).factors(form, both)[-1])
-                )
+                factor = evidence.posterior(form, both, logs, 0).factors(form, both)[-1]
+                if factor[0] > 0 or not x.placed.effect.opposes_motion:  # its fit would stay at the impossible sign
+                    alternatives.append(_start_entry(form.candidates[j], factor))
     return alternatives
 
 

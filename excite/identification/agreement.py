@@ -15,6 +15,7 @@ import scipy
 
 from excite.errors import NoEstimateError
 from excite.identification.estimate import Estimate
+from excite.identification.joint import UnexplainedError
 from excite.identification.methods import identify
 from excite.logs import Log
 from excite.model import Model
@@ -58,20 +59,23 @@ class Agreement:
 
 def compare_sources(
     model: Model, logs: Sequence[Log], method: str, filter: Filter
-) -> tuple[Agreement | None, list[Estimate]]:
+) -> tuple[Agreement | None, list[Estimate], bool | None]:
     """Identify each file of logs by itself and compare the estimates.
 
     Return no comparison and no estimates for one file, if one of them gives no estimate, or if the method knows that
-    the model alone does not explain one: what it lacks may differ as well.
+    the model alone does not explain one: what it lacks may differ as well. Then it does not explain all logs, and the
+    last is False, else None.
     """
     groups = group_by_file(logs)
     if len(groups) < 2:
-        return None, []
+        return None, [], None
     try:
         estimates = [identify(model, group, method, filter, explained=True) for group in groups.values()]
+    except UnexplainedError:
+        return None, [], False
     except NoEstimateError:
-        return None, []
-    return compare_logs(tuple(groups), estimates), estimates
+        return None, [], None
+    return compare_logs(tuple(groups), estimates), estimates, None
 
 
 def group_by_file(logs: Sequence[Log]) -> dict[str, list[Log]]:

@@ -57,13 +57,13 @@ def identify(
     logs: Sequence[Log],
     method: str = "ols",
     filter: Filter | None = None,
-    explained: bool = False,
+    explained: bool | None = None,
 ) -> Estimate:
     """Estimate the base parameters from one log or several.
 
     Single spikes are repaired with a note (see `examine`), doubts about a log are noted, and an unidentifiable
-    parameter comes with the manoeuvre that would identify it. explained: give no estimate where the method knows that
-    the model alone does not explain the logs.
+    parameter comes with the manoeuvre that would identify it. explained: True to give no estimate where the method
+    knows that the model alone does not explain the logs, False if that is known to be so.
 
     Raises ValueError for an unknown method, MachineError for sensors or effects the method does not support,
     NotIdentifiableError, LogError for a log that cannot be repaired, and UnexplainedError.
@@ -98,7 +98,8 @@ def identify(
         try:
             chosen = METHODS[method]
             otherwise = _refuse if explained and chosen.exact else chosen.otherwise or chosen.find
-            estimate = estimate_in_full(otherwise, chosen.exact, model, repaired, filter)
+            exact = _refuse if explained is False and chosen.exact else chosen.exact
+            estimate = estimate_in_full(otherwise, exact, model, repaired, filter)
             estimate = add_advice(model, repaired, estimate, filter)
         except np.linalg.LinAlgError:
             raise NotIdentifiableError(
@@ -275,7 +276,7 @@ def unused_sensors(model: Model, method: str, logs: Sequence[Log]) -> tuple[str,
 
 
 def _refuse(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
-    """Raise UnexplainedError, in the place of an estimate beside forces that the model lacks."""
+    """Raise UnexplainedError, in the place of an estimate that cannot be, or that is not wanted."""
     raise UnexplainedError("the model alone does not explain the log")
 
 

@@ -6,7 +6,6 @@ Every start goes through the first stages of `continuation`, the best of them th
 from __future__ import annotations
 
 import itertools
-import os
 import signal
 import tempfile
 import threading
@@ -204,8 +203,8 @@ def ignore_killed_workers(stop: Path) -> Iterator[None]:
 
 
 def process_count() -> int:
-    """Return the number of parallel processes: one per core, two at least."""
-    return max(2, os.cpu_count() or 1)
+    """Return the number of parallel processes: one per core that a container may use, two at least."""
+    return max(2, joblib.cpu_count())
 
 
 def _screening_order(state: SearchState) -> tuple[bool, float, int]:

@@ -39,9 +39,9 @@ def identify_from(model: Model, logs: Sequence[Log], method: str) -> IdentifyRes
     Raises NoEstimateError, LogError.
     """
     chosen = model.machine.filter
-    agreement, _ = identification.compare_sources(model, logs, method, chosen)
+    agreement, _, explained = identification.compare_sources(model, logs, method, chosen)
     try:
-        estimate = identification.identify(model, logs, method, chosen)
+        estimate = identification.identify(model, logs, method, chosen, explained)
     except NoEstimateError as err:
         if agreement is None or agreement.agree:
             raise
@@ -51,7 +51,7 @@ def identify_from(model: Model, logs: Sequence[Log], method: str) -> IdentifyRes
     if agreement is not None:
         estimate = identification.widen(estimate, agreement.ratio)
     used = [examine(model.machine, one).log for one in logs]
-    if model.slips and identification.METHODS[method].biased:
+    if model.slips and identification.METHODS[method].biased and estimate.status != "invalid":
         estimate = identification.add_bias(model, used, estimate, chosen)
         if estimate.bias is not None and (np.abs(np.nan_to_num(estimate.bias)) > estimate.std).any():
             doubt = estimate.doubt or f"on simulated logs like this {method} is off by more than its intervals say"

@@ -207,21 +207,21 @@ def test_a_curve_goes_into_the_machine_file_and_holds_on_another_log(emps: Model
 
 @pytest.mark.slow
 def test_names_and_sizes_over_many_logs(emps: Model) -> None:
-    """Twelve logs of each kind: no name where nothing is hidden, hardly a wrong one, and sizes that hold.
+    """Eight logs of each kind: no name where nothing is hidden, hardly a wrong one, and sizes that hold.
 
     Measured on 24 others of each kind: 71 of 72 named, none wrongly; of 30 with nothing hidden none.
     """
-    none = [diagnosed(emps, rig_log(seed)) for seed in range(100, 112)]
+    none = [diagnosed(emps, rig_log(seed)) for seed in range(100, 108)]
     assert not any(d.findings or d.curves for d in none)
     named = wrong = 0
     for effect, (hidden, size) in HIDDEN.items():
-        findings = [f for seed in range(100, 112) for f in diagnosed(emps, rig_log(seed, hidden)).findings]
+        findings = [f for seed in range(100, 108) for f in diagnosed(emps, rig_log(seed, hidden)).findings]
         right = [f for f in findings if f.effect == effect]
         named += len(right)
         wrong += sum(f"{effect}@carriage" not in (f.name, *f.tied_with) for f in findings)
         z = np.array([(f.magnitude - size) / f.magnitude_std for f in right])
         assert 0.4 < np.mean(z**2) < 2.5, effect
-    assert named >= 30
+    assert named >= 20
     assert wrong <= 1
 
 

@@ -21,7 +21,7 @@ from excite.logs import is_profile, lowpass, profile_of
 from excite.model import Model
 from excite.simulation import Motion, exact_readings, measure, simulate
 
-SEEDS = 10
+SEEDS = 6
 NOISY_RIG = """extends = "emps"
 name = "noisy_rig"
 [sensor.q1]
@@ -84,7 +84,7 @@ def covered(model: Model, fitted: Motion, target: Motion, seed: int) -> tuple[fl
 def test_bands_hold_the_truth_on_a_rig(rig: Model) -> None:
     """Torques along a log, and along a drive the torque that the motion needs, speed and position.
 
-    Errors along a drive are those of ten estimates, each inside or outside nearly all along.
+    Errors along a drive are those of six estimates, each inside or outside nearly all along.
     """
     fitted, target = swing(rig, 0.8, 1.7), swing(rig, 0.6, 2.1)
     shares = np.mean([covered(rig, fitted, target, seed) for seed in range(SEEDS)], axis=0)

@@ -80,7 +80,7 @@ class Tab:
             self.page.clock.pause_at(1000)
 
     def shows(self, id: str, text: str) -> None:
-        self.page.locator(id, has_text=text).wait_for(state="attached", timeout=8000)
+        self.page.locator(id, has_text=text).wait_for(state="attached", timeout=60_000)
 
     def text(self, id: str) -> str:
         return str(self.page.inner_text(id))

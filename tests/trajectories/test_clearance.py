@@ -282,13 +282,14 @@ def test_the_checker_sees_an_arm_that_folds_or_dips() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "seed"), [("ur10", 0), ("ur10", 1), ("ur10e", 0), ("panda", 0)])
+@pytest.mark.parametrize(("name", "seed"), [("ur10", 0), ("panda", 0)])
 def test_shipped_arms_touch_nothing_at_a_kilohertz(name: str, seed: int) -> None:
     model = build(load_machine(name))
     _, problem = choose_problem(model.machine, None, None)
     request = DesignRequest(starts=1, seed=seed, trajectory="fourier", cond_slack=0.0)
     found = design_from(model, problem, request).design
     assert found.max_violation <= joint_search.ROUNDING
+    assert found.cond_phi < {"ur10": 6.5, "panda": np.inf}[name]  # results/duel has what other solvers reach
     motion = trajectories.planned_motion(model, found.motion.t, found.motion.q).at(HZ)
     gap, pair = least_gap(model.machine, motion.q)
     assert gap > 0.0195, pair

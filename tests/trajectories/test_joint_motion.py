@@ -244,15 +244,6 @@ def test_arm_without_problem_and_noise_figures_is_designed(arm: Model) -> None:
     assert found.model.machine.sensor[1].noise.value == pytest.approx(0.005 * 40)
 
 
-@pytest.mark.slow
-def test_ur10_is_designed_by_itself() -> None:
-    """Measured 4.5; results/duel has what other solvers reach from the same start."""
-    model, _, problem = prepare_design("ur10", None, None, DesignRequest())
-    found = design_from(model, problem, DesignRequest(starts=1, trajectory="fourier")).design
-    assert found.cond_phi < 6.5
-    assert found.max_violation == 0
-
-
 def test_design_takes_zeros_that_no_torque_shows_from_the_file(arm: Model, problem: Problem) -> None:
     """The zero of the upper arm shows and counts; that of the forearm is a turn of its own centre of mass."""
     sought = tuple(s.model_copy(update={"zero": "sought"}) if s.kind == "angle" else s for s in arm.machine.sensor)

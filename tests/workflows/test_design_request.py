@@ -73,11 +73,10 @@ def test_a_design_says_how_far_above_the_bound_it_is(excite: Excite, tmp_path: P
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("machine", ["va12_straight", "tandem"])
-def test_the_default_is_as_accurate_as_its_best_random_start(excite: Excite, tmp_path: Path, machine: str) -> None:
+def test_the_default_is_as_accurate_as_its_best_random_start(excite: Excite, tmp_path: Path) -> None:
     """The other end is beside it, in summary and report."""
     out = tmp_path / "d"
-    code, shown, err = excite("design", machine, "--duration", 12, "--starts", 2, "--out", out, "--json")
+    code, shown, err = excite("design", "va12_straight", "--duration", 12, "--starts", 2, "--out", out, "--json")
     assert code == 0, err
     summary = json.loads(shown)
     assert summary["worst_percent"] <= 1.001 * summary["random_start_percent"]

@@ -715,10 +715,10 @@ while not out.exists():
 def test_killed_at_random_times_it_loses_nothing(
     tiny: Callable[..., StudyPlan], tmp_path: Path, snapshot: dict[str, str]
 ) -> None:
-    """Sixty kills (-9, Ctrl-C) of the driver: what was kept stays, is not computed again, and the table is the same."""
+    """Kills (-9, Ctrl-C) of the driver: what was kept stays, is not computed again, and the table is the same."""
     tiny(10)
     (tmp_path / "nursery.py").write_text(NURSERY)
-    command = [sys.executable, "nursery.py", "tiny.toml", "out", "7", "60"]
+    command = [sys.executable, "nursery.py", "tiny.toml", "out", "7", "25"]
     subprocess.run(command, cwd=tmp_path, env=snapshot, check=True, timeout=3000)
     told = json.loads((tmp_path / "told.json").read_text())
     before: set[int] = set()
@@ -734,7 +734,7 @@ def test_killed_at_random_times_it_loses_nothing(
         before = set() if trial["there"] else now
     kills = sum(t["killed"] for t in told["trials"])
     print(f"\n{kills} kills, {told['finished'] + 1} studies finished, {lost} runs of batches under way computed again")
-    assert kills >= 50
+    assert kills >= 20
     reference = (tmp_path / "measure" / "runs.parquet").read_bytes()
     done = [tmp_path / "out", *tmp_path.glob("finished*")]
     assert {(p / "runs.parquet").read_bytes() for p in done} == {reference}
