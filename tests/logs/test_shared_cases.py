@@ -8,14 +8,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from support.files import SHARED
+from support.files import case
 
 import excite
 from excite.errors import ExciteError, LogError
 from excite.logs import inspect, prepare, read_table
 from excite.model import Model
-
-CASES = SHARED.parent / "cases"
 
 # file: (rate [Hz], stretches, words of a note)
 READ: dict[str, tuple[float, int, str]] = {
@@ -48,13 +46,6 @@ READ: dict[str, tuple[float, int, str]] = {
     "L1_check_says_usable/j1b_jitter1ms.csv": (100, 1, "rows are 8 to 12 ms apart"),
     "R2_held_channel/j9_torque_held5.csv": (100, 1, "changes in every fifth row only"),
 }
-
-
-def case(name: str) -> Path:
-    path = CASES / name
-    if not path.is_file():
-        pytest.skip(f"the shared cases are not here ({path})")
-    return path
 
 
 @pytest.mark.parametrize("name", READ)

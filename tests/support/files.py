@@ -7,10 +7,18 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import pytest
+
 SHARED = Path(__file__).parents[3] / "shared" / "data"
-
-
 RESULTS = Path(__file__).parents[2] / "results"
+
+
+def case(name: str) -> Path:
+    """Return a file of the shared cases; the test skips where they are missing."""
+    path = SHARED.parent / "cases" / name
+    if not path.is_file():
+        pytest.skip(f"the shared cases are not here ({path})")
+    return path
 
 
 def study(name: str, script: str = "study") -> ModuleType:
