@@ -20,10 +20,10 @@ from excite.cli import (  # noqa: E402
     fail,
 )
 from excite.errors import ExciteError, StoppedError  # noqa: E402
+from excite.output import FULL  # noqa: E402
 
 BESIDE_THE_WORK = str(StoppedError("the machine was being read, or the result written"))
-# Errors of the file system that the user can mend: full disk, quota, too large a file, read-only, no permission.
-USERS_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
+USERS_DISK = (*FULL, errno.EACCES)  # errors of the file system that the user can mend
 
 
 def main() -> None:

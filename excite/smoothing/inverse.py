@@ -58,11 +58,12 @@ class Design:
     """Columns of a log that stay as they are in a pass.
 
     delay (N, n): change of each torque by a shift of a second. nodes: by channel (N, n_channel) the weights of the
-    discrepancy's nodes.
+    discrepancy's nodes. unresolved (N, n): variance of torques beside noise [N2 m2].
     """
 
     delay: np.ndarray
     nodes: tuple[np.ndarray, ...]
+    unresolved: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +156,7 @@ def cost_of(
     total = 0.0
     for n, (chain, design) in enumerate(zip(problem.chains, designs, strict=True)):
         residual = chain.average(torque_parts(problem, chain, design, basis, point, n))
-        standard = residual * np.sqrt(chain.count) / sizes.noise
+        standard = residual * np.sqrt(chain.count / (sizes.noise**2 + chain.average(design.unresolved)))
         total += float((robust_weights(standard, sizes.tails)[0] * (chain.count > 0)).sum())
         coefficients = point.coefficients[n]
         for j in range(problem.channels):
@@ -247,7 +248,7 @@ def chunks(chain: Chain) -> list[tuple[int, int, int, int]]:
 
 def rows_of(design: Design, first: int, last: int) -> Design:
     """Return the columns of some rows."""
-    return Design(design.delay[first:last], tuple(x[first:last] for x in design.nodes))
+    return Design(design.delay[first:last], tuple(x[first:last] for x in design.nodes), design.unresolved[first:last])
 
 
 def part_of(chain: Chain, first: int, last: int, row: int, end: int) -> Chain:
@@ -271,7 +272,7 @@ class SlotTerms:
     """Slots of some intervals: residual (S, n), slopes by unknowns (S, n, 6 w) and parameters (S, n, n_base + n).
 
     nodes: weights (S, n_channel) of the discrepancy by channel. weight (S, n): of the squares; curvature: in the
-    information.
+    information. variance (S, n): of a row's torque.
     """
 
     residual: np.ndarray
@@ -280,6 +281,7 @@ class SlotTerms:
     nodes: tuple[np.ndarray, ...]
     weight: np.ndarray
     curvature: np.ndarray
+    variance: np.ndarray
 
 
 def slot_terms(
@@ -305,8 +307,9 @@ def slot_terms(
     parameters = np.concatenate([W * problem.model.scale, delay], axis=2)
     residual = part.average(residual)
     count = part.count
-    _, robust, bend = robust_weights(residual * np.sqrt(count) / sizes.noise, sizes.tails)
-    weight = count / sizes.noise**2 * robust
+    variance = sizes.noise**2 + part.average(design.unresolved)
+    _, robust, bend = robust_weights(residual * np.sqrt(count / variance), sizes.tails)
+    weight = count / variance * robust
     nodes = tuple(part.average_channel(x, j) for j, x in enumerate(design.nodes))
     return SlotTerms(
         residual,
@@ -315,6 +318,7 @@ def slot_terms(
         nodes,
         weight,
         weight * bend,
+        variance,
     )
 
 

@@ -22,7 +22,7 @@ from excite.smoothing.inverse import (
     reduce_problem,
     torque_parts,
 )
-from excite.smoothing.inverse_chain import TorqueModel, build_chain, torque_sensors
+from excite.smoothing.inverse_chain import Chain, TorqueModel, build_chain, torque_sensors
 from excite.smoothing.inverse_sizes import correlation_factor, update_sizes
 from excite.smoothing.log_fit import HELD_STD, NotConvergedError, held_in_turn, prior_information, prior_terms
 from excite.smoothing.motion_readings import (
@@ -188,7 +188,8 @@ def first_state(model: Model, logs: Sequence[Log], settings: InverseSettings, be
         tuple(np.ones((k.count, n)) for k in knots),
     )
     point = Point(coefficients, model.nominal.copy(), np.zeros(n), np.zeros(0))
-    designs = tuple(Design(np.zeros_like(c.torque), tuple(np.zeros((len(c.t), 0)) for _ in range(n))) for c in chains)
+    none = [np.zeros_like(c.torque) for c in chains]
+    designs = tuple(Design(x, (x[:, :0],) * n, x) for x in none)
     state = State(
         point, np.zeros(0), sizes, np.zeros(0), designs, np.zeros(len(model.nominal)), problem, None, np.zeros(0)
     )
@@ -288,8 +289,21 @@ def with_designs(state: State, settings: InverseSettings, admit: bool, moving: b
             basis.rows(j, n, motion[:, 1, j], motion[:, 0, j], chain.t) if basis is not None else np.zeros((len(y), 0))
             for j in range(problem.channels)
         )
-        designs.append(Design(delay, nodes))
+        designs.append(Design(delay, nodes, unresolved_variance(problem, chain, motion, point.X)))
     return replace(state, problem=problem, basis=basis, point=point, designs=tuple(designs))
+
+
+def unresolved_variance(problem: Problem, chain: Chain, motion: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """Return the variance (N, n) [N2 m2] of torques that bend with the speed within a row, as friction that turns.
+
+    The motion (N, 3, n) is smooth between rows and rounds the corner that such a torque makes in it. The error is taken
+    as uniform up to the torque's second difference over the speeds of a row before and after, which vanishes where rows
+    resolve the bend.
+    """
+    row = np.zeros_like(motion)
+    row[:, 1] = motion[:, 2] * np.gradient(chain.t)[:, None]
+    before, here, after = (problem.torque.prediction(chain, motion + k * row, X) for k in (-1, 0, 1))
+    return (after - 2 * here + before) ** 2 / 3
 
 
 def moved_channels(state: State) -> State:

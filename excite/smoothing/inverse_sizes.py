@@ -137,10 +137,11 @@ def _add_slots(
         s = slot_terms(problem, part, rows_of(design, row, end), basis, sizes, point, m)
         cross = covariance[first + part.slot // part.slots] @ s.by_motion.transpose(0, 2, 1)
         there = part.count > 0
-        found.square += (s.weight * s.residual**2 * sizes.noise**2).sum(axis=0)
-        found.number += there.sum(axis=0)
-        found.spent += (np.einsum("sji,sij->sj", s.by_motion, cross) * s.curvature).sum(axis=0)
-        z = s.residual * np.sqrt(part.count) / sizes.noise
+        share = (sizes.noise**2 / s.variance) ** 2  # what else a slot's variance holds may not be there
+        found.square += (share * s.weight * s.residual**2 * s.variance).sum(axis=0)
+        found.number += (share * there).sum(axis=0)
+        found.spent += (share * np.einsum("sji,sij->sj", s.by_motion, cross) * s.curvature).sum(axis=0)
+        z = s.residual * np.sqrt(part.count / s.variance)
         for j, own in enumerate(found.standard):
             own.append(z[there[:, j], j])
         if not first_passes:
@@ -183,7 +184,7 @@ def correlation_factor(
                     columns = slice(p + int(start), p + int(start) + count)
                     score += (s.nodes[j] * force[:, j : j + 1]) @ gain[:, columns].T
             scores.append(score)
-            z.append(np.clip(s.residual * np.sqrt(part.count) / sizes.noise, -4, 4))
+            z.append(np.clip(s.residual * np.sqrt(part.count / s.variance), -4, 4))
         psi = np.concatenate(scores)
         white += (psi**2).sum(axis=0)
         for k, count in enumerate(BLOCK_COUNTS):
