@@ -19,11 +19,9 @@ from excite.cli import (  # noqa: E402
     app,
     fail,
 )
-from excite.errors import ExciteError, StoppedError  # noqa: E402
-from excite.output import FULL  # noqa: E402
+from excite.errors import DISK, ExciteError, StoppedError  # noqa: E402
 
 BESIDE_THE_WORK = str(StoppedError("the machine was being read, or the result written"))
-USERS_DISK = (*FULL, errno.EACCES)  # errors of the file system that the user can mend
 
 
 def main() -> None:
@@ -67,7 +65,7 @@ def _exit_code(err: Exception) -> int | None:
     """Return the exit code of an error, None for a defect of the program."""
     if isinstance(err, ExciteError):
         return err.exit_code
-    return 1 if isinstance(err, OSError) and err.errno in USERS_DISK else None
+    return 1 if isinstance(err, OSError) and err.errno in (*DISK, errno.EACCES) else None
 
 
 if __name__ == "__main__":

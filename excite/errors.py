@@ -6,6 +6,10 @@ Any exception that is not an `ExciteError` is a defect of the program.
 
 from __future__ import annotations
 
+import errno
+
+DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # what the user can mend, and no defect of the program
+
 
 class ExciteError(Exception):
     """An error whose message is meant for the user."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import glob
 import itertools
 import json
@@ -21,10 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from excite.errors import DiskError, FolderError
+from excite.errors import DISK, DiskError, FolderError
 
 SUMMARY = "summary.json"
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # what the user can mend, and no defect of the program
 MAX_NAME = 60  # letters of a result's name: of four bytes each they fit into a file name
 MOST_DIGITS = 300  # of an integer: floats end at 1.8e308
 # entries of a summary that say how a result was made
@@ -200,7 +198,7 @@ def _disk(out: Path) -> Iterator[None]:
     try:
         yield
     except OSError as err:
-        if err.errno not in FULL:
+        if err.errno not in DISK:
             raise
         part = f" ({Path(os.fsdecode(err.filename)).name})" if err.filename else ""
         raise DiskError(
