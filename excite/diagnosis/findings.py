@@ -160,8 +160,7 @@ def explain(
 ) -> Assessment:
     """Diagnose logs by joint smoothing, or by regression on the torques where all joints are driven and rigid.
 
-    Where these torques are explained, joint smoothing says what shows near rest alone, if it can follow the motion with
-    exact dynamics; what it then leaves unexplained is said.
+    Where these torques are explained, joint smoothing says what shows near rest alone, if exact dynamics follow that.
     Several logs are compared first: if each alone is explained and they differ in parameters, that is the answer.
     budget_s [s]: after it, and after a first Ctrl-C, nothing new is begun, and the best answer so far is given. Raises
     NoEstimateError.

@@ -296,9 +296,8 @@ def with_designs(state: State, settings: InverseSettings, admit: bool, moving: b
 def unresolved_variance(problem: Problem, chain: Chain, motion: np.ndarray, X: np.ndarray) -> np.ndarray:
     """Return the variance (N, n) [N2 m2] of torques that bend with the speed within a row, as friction that turns.
 
-    The motion (N, 3, n) is smooth between rows and rounds the corner that such a torque makes in it. The error is taken
-    as uniform up to the torque's second difference over the speeds of a row before and after, which vanishes where rows
-    resolve the bend.
+    A smooth motion (N, 3, n) rounds the corner that they make in it: an error, taken as uniform, up to the torque's
+    second difference over the speeds of a row before and after. Where rows resolve the bend it vanishes.
     """
     row = np.zeros_like(motion)
     row[:, 1] = motion[:, 2] * np.gradient(chain.t)[:, None]

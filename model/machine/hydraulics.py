@@ -40,6 +40,8 @@ class Cylinder(FileRecord):
             raise ValueError("lever: give it, or both anchor and pin")
         if self.lever is not None and self.lever.value == 0:
             raise ValueError("lever: must not be 0")
+        if float(self.rod_area) > float(self.area):
+            raise ValueError("rod_area: the piston without the rod can't be larger than the piston, area")
         return self
 
 

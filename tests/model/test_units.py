@@ -259,6 +259,12 @@ def test_cylinders_do_the_work_that_their_oil_does(
     assert 2 * turn * (push[0] * left + pull[0] * right) == pytest.approx(work, rel=1e-5, abs=1e-7)
 
 
+def test_a_piston_without_its_rod_is_no_larger_than_the_piston() -> None:
+    areas = {"area": {"value": 3e-3, "source": "assumed"}, "rod_area": {"value": 5e-3, "source": "assumed"}}
+    with pytest.raises(ValueError, match="rod_area: the piston without the rod"):
+        Cylinder.model_validate({**areas, "lever": {"value": 0.3, "source": "assumed"}})
+
+
 def test_pressures_of_cylinders_become_the_joints_torque(cylinders: prediction.Model) -> None:
     """Straight, both cylinders have the lever 0.35 m: 100 bar on one side turn by p (A + A_rod) 0.35 m = 28.3 kN m."""
     sensor = next(s for s in cylinders.machine.sensor if s.name == "u2")
