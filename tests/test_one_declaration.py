@@ -6,8 +6,11 @@ What is added in one place is there for every command, in help, errors, pages an
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -293,3 +296,68 @@ def offered(excite: Excite, command: str, option: str, name: str) -> None:
     (line,) = (line for line in page.splitlines() if line.startswith(f"| `--{option}` |"))
     assert line.endswith(f"{name} |")
     assert name in requests.choices(option)
+
+
+ADDED = {
+    "excite/trajectories/objective.py": """
+
+def spread(variances: ca.SX, sharp: ca.SX) -> ca.SX:
+    return ca.logsumexp(ca.log(variances) / 2)
+
+
+OBJECTIVES["spread"] = Objective(spread, "variances", True)
+""",
+    "excite/trajectories/limits.py": """
+
+def _wheelspin(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
+    a, b = (s.nu[model.coordinates.index(c)] for c in ("theta1", "theta4"))
+    yield "wheelspin", a - b, -0.02, 0.02, "rad/s"
+
+
+LIMITS["wheelspin"] = LimitKind(_wheelspin)
+""",
+    "excite/trajectories/baselines.py": """
+
+def stamp(model: Model, problem: Problem, seed: int, seconds: float) -> Manoeuvre:
+    t = excitation.knot_times(problem)
+    return Manoeuvre(t, np.outer(np.sin(2 * np.pi * t / t[-1]), [2000.0] * len(model.inputs)))
+
+
+BASELINES["stamp"] = Baseline(stamp)
+""",
+    "excite/identification/methods.py": """
+
+METHODS["twice"] = Method(lambda model, logs, filter: ols(model, logs, filter))
+""",
+    "model/machines/heavy.toml": 'extends = "va12_straight"\nname = "heavy"\ntitle = "A heavy one"\n'
+    '[problems.S40]\nduration_s = { value = 8, source = "definition" }\n',
+}
+
+
+@pytest.mark.slow
+def test_the_same_written_into_a_copy_of_the_program(tmp_path: Path) -> None:
+    """By the real commands and their processes: the new machine's drive for the new objective, in the new limit."""
+    for package in ("excite", "model"):
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"), symlinks=True)
+    for name, text in ADDED.items():
+        with (tmp_path / name).open("a", encoding="utf-8") as file:
+            file.write(text)
+
+    def run(*command: object) -> dict[str, object]:
+        done = subprocess.run(
+            [sys.executable, "-m", "excite", *map(str, command), "--json"],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(tmp_path)},
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=900,
+        )
+        assert done.returncode == 0, done.stderr
+        return dict(json.loads(done.stdout))
+
+    said = run("design", "heavy", "--objective", "spread", "--starts", 1, "--out", "d")
+    assert said["violations"]["wheelspin"] <= 1e-3  # type: ignore[index]
+    assert run("verify", "d", "--runs", 2, "--method", "twice", "--out", "v")["method"] == "twice"
+    found = run("compare", "heavy", "--against", "stamp", "--budget", 90, "--out", "c")
+    assert [d["name"] for d in found["designs"]] == ["designed", "stamp"]  # type: ignore[attr-defined]

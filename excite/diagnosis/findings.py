@@ -239,7 +239,7 @@ def _explain(
             raise
         return torques
     d = every.diagnosis
-    told = d.verdict in ("named", "tied") or (d.verdict == "unexplained" and d.exact[0])
+    told = d.verdict in ("named", "tied") or (d.verdict == "unexplained" and d.exact[0] and not deadline.reached)
     return every if torques is None or told else torques
 
 

@@ -170,14 +170,16 @@ def _alternatives(form: evidence.Form, found: Chosen) -> list[EffectEntry]:
     for k, x in enumerate(found.candidates):
         rest = [*found.candidates[:k], *found.candidates[k + 1 :]]
         gains = evidence.first_gains(form, rest, logs)
-        own = [j for j, y in enumerate(form.candidates) if y.name == x.name]
-        best = max(float(gains[j]) for j in own)
-        for j in own:
+        own = dict[int, np.ndarray]()
+        for j in (j for j, y in enumerate(form.candidates) if y.name == x.name):
+            both = [*rest, form.candidates[j]]
+            factor = evidence.posterior(form, both, logs, 0).factors(form, both)[-1]
+            if factor[0] > 0 or not x.placed.effect.opposes_motion:  # its fit would stay at the impossible sign
+                own[j] = factor
+        best = max((float(gains[j]) for j in own), default=0.0)
+        for j, factor in own.items():
             if gains[j] > best - RIVAL_LOSS and form.candidates[j] is not x:
-                both = [*rest, form.candidates[j]]
-                factor = evidence.posterior(form, both, logs, 0).factors(form, both)[-1]
-                if factor[0] > 0 or not x.placed.effect.opposes_motion:  # its fit would stay at the impossible sign
-                    alternatives.append(_start_entry(form.candidates[j], factor))
+                alternatives.append(_start_entry(form.candidates[j], factor))
     return alternatives
 
 

@@ -63,8 +63,8 @@ def compare_sources(
     """Identify each file of logs by itself and compare the estimates.
 
     Return no comparison and no estimates for one file, if one of them gives no estimate, or if the method knows that
-    the model alone does not explain one: what it lacks may differ as well. Then it does not explain all logs, and the
-    last is False, else None.
+    the model alone does not explain one: what it lacks may differ as well. The last is False then, as the model does
+    not explain all logs either, and None if that is open.
     """
     groups = group_by_file(logs)
     if len(groups) < 2:

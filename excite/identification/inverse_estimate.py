@@ -108,7 +108,7 @@ def _build_estimate(
         notes,
         doubt=_doubt(fit),
         discrepancy=_discrepancies(model, fit),
-        innovations=np.concatenate([(r / fit.sizes.noise).T for r in fit.residual], axis=1),
+        innovations=np.concatenate([(r / s).T for r, s in zip(fit.residual, fit.std, strict=True)], axis=1),
         lacking=np.concatenate([x.T for x in fit.extra], axis=1),
         alignments={s.name: (float(x), float(d)) for s, x, d in zip(sensors, fit.shift, fit.shift_std, strict=True)},
     )

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from excite.logs import Log, white_noise
 from excite.model import Model, with_least_smoothing
@@ -68,8 +69,9 @@ class InverseFit:
 
     status: "converged", "stalled" (no step lowers the cost any more, short of convergence) or "passes" (out of them).
     X (n_base,), covariance (n_base, n_base) [SI], held (n_base,): parameters that the logs do not show. costs: before
-    and after each step. motion: q, q', q'' (N, 3, n) of each log; residual: of torque (N, n), without discrepancies;
-    extra: discrepancies and alignment (N, n) [N m]. components: of discrepancy, with their sizes and rms [N m].
+    and after each step. motion: q, q', q'' (N, 3, n) of each log; residual: of torque (N, n), without discrepancies,
+    and its std; extra: discrepancies and alignment (N, n) [N m]. components: of discrepancy, with their sizes and rms
+    [N m].
     shift, shift_std (n,) [s]: of the torque channels.
     """
 
@@ -81,6 +83,7 @@ class InverseFit:
     sizes: NoiseSizes
     motion: tuple[np.ndarray, ...]
     residual: tuple[np.ndarray, ...]
+    std: tuple[np.ndarray, ...]
     extra: tuple[np.ndarray, ...]
     components: tuple[tuple[Component, float, float], ...]
     shift: np.ndarray
@@ -297,12 +300,12 @@ def unresolved_variance(problem: Problem, chain: Chain, motion: np.ndarray, X: n
     """Return the variance (N, n) [N2 m2] of torques that bend with the speed within a row, as friction that turns.
 
     A smooth motion (N, 3, n) rounds the corner that they make in it: an error, taken as uniform, up to the torque's
-    second difference over the speeds of a row before and after. Where rows resolve the bend it vanishes.
+    second difference over the speeds of a row before and after, of the row or one beside it.
     """
     row = np.zeros_like(motion)
     row[:, 1] = motion[:, 2] * np.gradient(chain.t)[:, None]
     before, here, after = (problem.torque.prediction(chain, motion + k * row, X) for k in (-1, 0, 1))
-    return (after - 2 * here + before) ** 2 / 3
+    return np.asarray(scipy.ndimage.maximum_filter1d(np.abs(after - 2 * here + before), 3, axis=0) ** 2 / 3)
 
 
 def moved_channels(state: State) -> State:
@@ -584,6 +587,7 @@ def conclude(
         state.sizes,
         motions,
         tuple(residual),
+        tuple(np.sqrt(state.sizes.noise**2 + d.unresolved) for d in state.designs),
         tuple(extra),
         tuple(components),
         point.shift,

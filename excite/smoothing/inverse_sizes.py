@@ -137,13 +137,13 @@ def _add_slots(
         s = slot_terms(problem, part, rows_of(design, row, end), basis, sizes, point, m)
         cross = covariance[first + part.slot // part.slots] @ s.by_motion.transpose(0, 2, 1)
         there = part.count > 0
-        share = (sizes.noise**2 / s.variance) ** 2  # what else a slot's variance holds may not be there
+        share = (sizes.noise**2 / s.variance) ** 2  # noise is judged where little else is; that may not be there
         found.square += (share * s.weight * s.residual**2 * s.variance).sum(axis=0)
         found.number += (share * there).sum(axis=0)
         found.spent += (share * np.einsum("sji,sij->sj", s.by_motion, cross) * s.curvature).sum(axis=0)
         z = s.residual * np.sqrt(part.count / s.variance)
         for j, own in enumerate(found.standard):
-            own.append(z[there[:, j], j])
+            own.append(z[there[:, j] & (share[:, j] >= min(0.5, float(np.median(share[:, j])))), j])
         if not first_passes:
             found.pull += _determinant_slope(problem, part, s, cross, point, m)
 

@@ -379,6 +379,11 @@ class MotionProgram:
         """Path (N, 3, n_q) and basis (N, 3, n_c) with their derivatives where the information is summed."""
         return self._path, self._B
 
+    @property
+    def limit_samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """Path (N, 4, n_q) and basis (N, 4, n_c) with their derivatives where limits are kept."""
+        return self._limit_path, self._limit_B
+
     def _states(self, x: np.ndarray, path: np.ndarray, B: np.ndarray) -> np.ndarray:
         """Return q and its derivatives (N, orders n_q) at all samples."""
         return np.asarray((path + B @ self.coefficients(x).T).reshape(len(path), -1))

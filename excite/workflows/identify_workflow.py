@@ -34,7 +34,7 @@ class IdentifyResult:
 
 
 def identify_from(model: Model, logs: Sequence[Log], method: str) -> IdentifyResult:
-    """Estimate parameters from checked logs, with the method's bias and notes on values and late channels.
+    """Estimate parameters from checked logs, with notes on values and late channels, and the bias of what is no noise.
 
     Raises NoEstimateError, LogError.
     """

@@ -367,8 +367,8 @@ def _similar_machine(path: Path) -> str:
     """Return " (did you mean X?)" for a wrong name: a machine file in the same folder, or a shipped machine."""
     here = [p for p in sorted(path.parent.glob("*.toml")) if is_machine_file(p)]
     known = {n: n for n in shipped_machines()} | {p.stem: str(p) for p in here}
-    spelt = {stem.lower(): name for stem, name in known.items()}  # an end that all share is no likeness
-    like = closest(path.stem.lower(), spelt)
+    spelt = {stem.lower(): name for stem, name in known.items()}
+    like = closest(path.name.lower().removesuffix(".toml"), spelt)  # an end that all share is no likeness
     return f" (did you mean {spelt[like]}?)" if like else ""
 
 

@@ -239,14 +239,11 @@ def test_the_study_takes_cases_that_no_test_knows() -> None:
 
 
 @pytest.mark.slow
-def test_plain_causes_are_named() -> None:
-    """One of the causes; the study in results/diagnosis has all, of any size."""
-    told: dict[str, str] = {}
-    for name, number in list(PLAIN.items())[26:27]:
-        seen = blind(case("cause", name, number))
-        assert visibility(seen) > 10 * VISIBLE
-        told[seen.case.key] = score(seen.case, ask(seen.log)).outcome
-    assert all(o in ("right", "tied") for o in told.values()), told
+def test_a_plain_cause_is_named() -> None:
+    """The study in results/diagnosis has all, of any size."""
+    seen = blind(case("cause", "payload_shift", PLAIN["payload_shift"]))
+    assert visibility(seen) > 10 * VISIBLE
+    assert score(seen.case, ask(seen.log)).outcome in ("right", "tied")
 
 
 @pytest.mark.slow
@@ -283,12 +280,12 @@ def test_a_surprise_gets_no_name() -> None:
 
 
 @pytest.mark.slow
-def test_the_study_runs(tmp_path: Path) -> None:
+def test_the_study_runs_with_several_at_a_time(tmp_path: Path) -> None:
     """A case is driven, diagnosed, judged and told of."""
     study = ROOT / "results" / "diagnosis" / "study.py"
-    asked = "--seen --nothing 1 --per-cause 0 --per-surprise 0 --pairs 0 --jobs 2".split()
+    asked = "--seen --nothing 2 --per-cause 0 --per-surprise 0 --pairs 0 --jobs 2".split()
     done = subprocess.run([sys.executable, study, *asked, "--out", tmp_path], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     cases = pd.read_csv(tmp_path / "cases.csv")
-    assert list(cases.outcome) == ["clean"]
+    assert list(cases.outcome) == ["clean", "clean"]
     assert (tmp_path / "README.md").is_file()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from excite.model import build
 from excite.model.machine import load_machine
 from excite.simulation import measure
 from excite.smoothing import InverseSettings, fit_inverse
+from excite.smoothing.inverse_fit import unresolved_variance
 from excite.smoothing.motion_readings import (
     JointMotion,
     Readings,
@@ -100,6 +103,25 @@ def test_noise_is_told_from_motion_and_intervals_hold_on_clean_logs() -> None:
         z.append((fit.X - rig.nominal) / std)
     assert np.sqrt(np.mean(np.square(z), axis=0)).max() < 2.0
     assert np.abs(z).max() < 4.0
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.3])  # of the reversal from a row, in rows
+def test_friction_that_turns_between_rows_is_unresolved_there_alone(offset: float) -> None:
+    """20 N that turn within 2 mm/s, at 1 m/s2: rows of 20 ms see a jump, rows of 0.1 ms all of it."""
+    friction: Any = SimpleNamespace(
+        torque=SimpleNamespace(prediction=lambda chain, motion, X: 20 * np.tanh(motion[:, 1] / 2e-3) + motion[:, 1] * 5)
+    )
+    variance = []
+    for sample in (0.02, 1e-4):
+        t: Any = sample * np.arange(401)
+        v = t - t[200] - offset * sample
+        motion = np.stack([v**2 / 2, v, np.ones_like(v)], axis=1)[:, :, None]
+        variance.append(unresolved_variance(friction, SimpleNamespace(t=t), motion, np.zeros(0))[:, 0])  # type: ignore[arg-type]
+    coarse, fine = variance
+    assert (coarse[199:202] > 19.9**2 / 3).all()
+    assert coarse.max() < 40.1**2 / 3
+    assert max(coarse[:197].max(), coarse[204:].max()) < 1e-6
+    assert fine.max() < 0.1**2
 
 
 def test_a_motion_that_jolts_has_white_jerk() -> None:
