@@ -173,11 +173,11 @@ def test_a_study_can_be_rebuilt_where_it_is(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.slow
 def test_tutorial_runs_as_it_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its commands and lines, with fewer runs of a study and in Python."""
+    """Its commands and lines, with fewer runs of a study and in Python, and less time for the design."""
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
     shell = "excite() { " + f'"{sys.executable}" -m excite "$@"; ' + "}\nset -eu\n"
-    fewer = {"runs = 5": "runs = 1", "runs=3": "runs=1"}
+    fewer = {"runs = 5": "runs = 1", "runs=3": "runs=1", "--budget 60": "--budget 30"}
     for language, text in blocks(ROOT / "docs" / "tutorial.md"):
         for written in [w for w in fewer if w in text]:
             text = text.replace(written, fewer.pop(written))
