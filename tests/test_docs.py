@@ -203,7 +203,7 @@ def test_readme_lines_of_python_run(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert len([line for line in text.splitlines() if line and not line.startswith(("from", "import"))]) <= 5
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
-    text = text.replace("starts=2", "starts=1, duration=30")
+    text = text.replace("starts=2", "starts=1, duration=15")
     exec(compile(text, "README.md", "exec"), names)
     assert len(names["estimate"].names) == 22
 

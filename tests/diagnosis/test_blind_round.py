@@ -187,11 +187,6 @@ def test_a_heavy_side_of_a_roll_is_named_with_its_amount_and_gain() -> None:
     named(Hidden("roll_unbalance", "front_roll", 60.0))
 
 
-@pytest.mark.slow
-def test_a_slope_is_named_with_its_amount_and_gain() -> None:
-    named(Hidden("ground_slope", "machine", 0.004))
-
-
 PLAIN = {  # of each cause the first minute of driving in which it is ten times as large as what is just visible
     "stribeck_friction": 1,
     "load_dependent_friction": 0,
