@@ -14,11 +14,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import typer  # noqa: E402
 
 from excite import interrupt  # noqa: E402
-from excite.cli import (  # noqa: E402
-    INTERRUPTED,
-    app,
-    fail,
-)
+from excite.cli import INTERRUPTED, app, fail  # noqa: E402
 from excite.errors import DISK, ExciteError, StoppedError  # noqa: E402
 
 BESIDE_THE_WORK = str(StoppedError("the machine was being read, or the result written"))

@@ -183,6 +183,11 @@ def posterior(
     return Posterior(logs, gain - scatter, mean * size, np.sqrt(np.maximum(variance, 0)) * size)
 
 
+def factor_of(form: Form, x: Candidate, logs: np.ndarray, beside: Sequence[Candidate] = ()) -> np.ndarray:
+    """Return the factor of a candidate beside others, for sizes exp(logs)."""
+    return posterior(form, every := [*beside, x], logs, 0).factors(form, every)[-1]
+
+
 def first_gains(form: Form, chosen: Sequence[Candidate], logs: np.ndarray) -> np.ndarray:
     """Return the gain of each candidate beside those chosen, sizes unchanged; -inf where nothing shows it or its sign
     is impossible."""

@@ -170,16 +170,12 @@ def _alternatives(form: evidence.Form, found: Chosen) -> list[EffectEntry]:
     for k, x in enumerate(found.candidates):
         rest = [*found.candidates[:k], *found.candidates[k + 1 :]]
         gains = evidence.first_gains(form, rest, logs)
-        own = dict[int, np.ndarray]()
-        for j in (j for j, y in enumerate(form.candidates) if y.name == x.name):
-            both = [*rest, form.candidates[j]]
-            factor = evidence.posterior(form, both, logs, 0).factors(form, both)[-1]
-            if factor[0] > 0 or not x.placed.effect.opposes_motion:  # its fit would stay at the impossible sign
-                own[j] = factor
-        best = max((float(gains[j]) for j in own), default=0.0)
-        for j, factor in own.items():
-            if gains[j] > best - RIVAL_LOSS and form.candidates[j] is not x:
-                alternatives.append(_start_entry(form.candidates[j], factor))
+        own = [(float(gain), y) for gain, y in zip(gains, form.candidates, strict=True) if y.name == x.name]
+        if x.placed.effect.opposes_motion:  # a fit would stay at the impossible sign
+            own = [(gain, y) for gain, y in own if evidence.factor_of(form, y, logs, rest)[0] > 0]
+        best = max((gain for gain, _ in own), default=0.0)
+        near = [y for gain, y in own if gain > best - RIVAL_LOSS and y is not x]
+        alternatives += [_start_entry(y, evidence.factor_of(form, y, logs, rest)) for y in near]
     return alternatives
 
 
@@ -477,7 +473,7 @@ def _likely_rivals(every: evidence.Form, stage: ExtendedFit, name: str, runner: 
     form, gains = _in_place_of(stage.form([*found, Candidate(stage.fitted(name), (0,))], runner), stage, name)
     least = max(gains[-1] - max(RIVAL_LOSS, RIVAL_LOSS_SHARE * gains[-1]), 0.0)
     rivals = [x for x, gain in zip(form.candidates[:-1], gains[:-1], strict=True) if gain > least]
-    return [_start_entry(x, evidence.posterior(form, [x], form.nothing, 0).factors(form, [x])[0]) for x in rivals]
+    return [_start_entry(x, evidence.factor_of(form, x, form.nothing)) for x in rivals]
 
 
 def _in_place_of(form: evidence.Form, stage: ExtendedFit, name: str) -> tuple[evidence.Form, np.ndarray]:

@@ -246,7 +246,7 @@ class Search:
         best = [form.candidates[k] for k in evidence.best_of_each(form, gains, lambda x: x.name, 0.0)]
         found = []
         for x in [x for x in best if x.name not in known][: selection.MAX_RIVALS]:
-            factor = evidence.posterior(form, [x], form.nothing, 0).factors(form, [x])[0]
+            factor = evidence.factor_of(form, x, form.nothing)
             for rival in self.refined(rest, evidence.Chosen((x,), (factor,), (), 0.0, tuple(np.exp(form.nothing)))):
                 if self.gain(rest, rival.effect) < own - margin:
                     continue

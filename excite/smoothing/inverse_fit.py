@@ -292,20 +292,20 @@ def with_designs(state: State, settings: InverseSettings, admit: bool, moving: b
             basis.rows(j, n, motion[:, 1, j], motion[:, 0, j], chain.t) if basis is not None else np.zeros((len(y), 0))
             for j in range(problem.channels)
         )
-        designs.append(Design(delay, nodes, unresolved_variance(problem, chain, motion, point.X)))
+        designs.append(Design(delay, nodes, unresolved_variance(problem, chain, motion, y, point.X)))
     return replace(state, problem=problem, basis=basis, point=point, designs=tuple(designs))
 
 
-def unresolved_variance(problem: Problem, chain: Chain, motion: np.ndarray, X: np.ndarray) -> np.ndarray:
-    """Return the variance (N, n) [N2 m2] of torques that bend with the speed within a row, as friction that turns.
+def unresolved_variance(problem: Problem, chain: Chain, motion: np.ndarray, y: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """Return the variance (N, n) [N2 m2] of torques y (N, n) that bend with the speed within a row, as friction does.
 
     A smooth motion (N, 3, n) rounds the corner that they make in it: an error, taken as uniform, up to the torque's
     second difference over the speeds of a row before and after, of the row or one beside it.
     """
     row = np.zeros_like(motion)
     row[:, 1] = motion[:, 2] * np.gradient(chain.t)[:, None]
-    before, here, after = (problem.torque.prediction(chain, motion + k * row, X) for k in (-1, 0, 1))
-    return np.asarray(scipy.ndimage.maximum_filter1d(np.abs(after - 2 * here + before), 3, axis=0) ** 2 / 3)
+    before, after = (problem.torque.prediction(chain, motion + step, X) for step in (-row, row))
+    return np.asarray(scipy.ndimage.maximum_filter1d(np.abs(after - 2 * y + before), 3, axis=0) ** 2 / 3)
 
 
 def moved_channels(state: State) -> State:

@@ -45,7 +45,7 @@ class TorqueInput:
 
 @dataclass(frozen=True)
 class RunInputs:
-    """What all runs of a cell share.
+    """Inputs that all runs of a cell share.
 
     known: the machine that identification knows (JSON).
     true: the machine that is simulated, with its effects (JSON).

@@ -116,7 +116,8 @@ def test_friction_that_turns_between_rows_is_unresolved_there_alone(offset: floa
         t: Any = sample * np.arange(401)
         v = t - t[200] - offset * sample
         motion = np.stack([v**2 / 2, v, np.ones_like(v)], axis=1)[:, :, None]
-        variance.append(unresolved_variance(friction, SimpleNamespace(t=t), motion, np.zeros(0))[:, 0])  # type: ignore[arg-type]
+        here = friction.torque.prediction(None, motion, None)
+        variance.append(unresolved_variance(friction, SimpleNamespace(t=t), motion, here, np.zeros(0))[:, 0])  # type: ignore[arg-type]
     coarse, fine = variance
     assert (coarse[199:202] > 19.9**2 / 3).all()
     assert coarse.max() < 40.1**2 / 3
