@@ -27,6 +27,8 @@ CONTAINED_SHIFT = 0.5  # [total standard deviations] by which what is left may m
 CONTAINED_SHARE = 0.05  # of a drive's torque (rms) that may be left then; chosen
 BLOCK_S = 0.25  # length of the blocks whose sums show slow errors [s]; chosen
 WINDOW_S = 0.5  # length of the windows in which bursts are sought [s]; chosen
+READINGS_PER_DEGREE = 4.56  # of a noise level by differences (`white_noise`): its deviation is 1.51 / sqrt(readings)
+UNSEEN_RATIO = 0.3  # of residuals over noise below which nothing in them is seen beside the noise; chosen
 LAGS = 20  # of the portmanteau test; chosen
 KNOTS = 5  # of a curve of speed, torque, acceleration or angle; chosen
 TURNS = 2  # highest harmonic of a curve of an angle that turns around; chosen
@@ -123,14 +125,17 @@ def describe_failures(tests: Sequence[FitTest], most: int = 3) -> str:
     return "; ".join(shown[:most]) + more
 
 
-def _p_value(square: float, degrees: float, simulated: np.ndarray) -> float:
-    """Return the p-value of a sum of squares with so many degrees of freedom; simulated (B,): the same of noise."""
+def _p_value(square: float, degrees: float, simulated: np.ndarray, level_degrees: float = np.inf) -> float:
+    """Return the p-value of a sum of squares with so many degrees of freedom.
+
+    simulated (B,): the same of noise. level_degrees: degrees of freedom from which the noise's level is known.
+    """
     mean = float(np.mean(simulated))
     if degrees <= 0 or not mean > 0:
         return 1.0
     # Encoder counts that beat with the clock scatter more than their number says.
     degrees = min(degrees, 2 * mean**2 / max(float(np.var(simulated, ddof=1)), 1e-300)) if degrees > MANY else degrees
-    return float(scipy.stats.f.sf(square / mean, degrees, degrees * len(simulated)))
+    return float(scipy.stats.f.sf(square / mean, degrees, min(degrees * len(simulated), level_degrees)))
 
 
 def _noise_tests(one: WhiteResiduals) -> list[FitTest]:
@@ -145,14 +150,16 @@ def _noise_tests(one: WhiteResiduals) -> list[FitTest]:
         z = z if one.counted[j] else normal_scores(z)
         noise = one.noise[used, j].astype(float)
 
-        def add(what: str, statistic: tuple[np.ndarray, float], text: str, count: int = 1) -> None:
-            squares, degrees = statistic
-            p = min(1.0, count * _p_value(float(squares[0]), degrees, squares[1:]))
-            found.append(FitTest(name, what, p, f"{name}: {text}"))  # noqa: B023
-
+        level_degrees = np.inf if one.counted[j] else len(z) / READINGS_PER_DEGREE
         every = np.column_stack([z, noise])
         square = (every**2).sum(axis=0)
         ratio = np.sqrt(square[0] / np.mean(square[1:]))
+
+        def add(what: str, statistic: tuple[np.ndarray, float], text: str, count: int = 1) -> None:
+            squares, degrees = statistic
+            p = min(1.0, count * _p_value(float(squares[0]), degrees, squares[1:], level_degrees))  # noqa: B023
+            found.append(FitTest(name, what, p, f"{name}: {text}", contained=ratio < UNSEEN_RATIO))  # noqa: B023
+
         add("size", (square, len(z)), f"residuals are {ratio:.2f} times what noise gives")
         blocks = max(len(z) // max(round(BLOCK_S / step), 5), 1)
         sums = np.array([part.sum(axis=0) / np.sqrt(len(part)) for part in np.array_split(every, blocks)])
@@ -187,7 +194,7 @@ def _noise_tests(one: WhiteResiduals) -> list[FitTest]:
         largest = int(np.argmax(np.abs(z)))
         # Encoder counts have larger largest errors than normal noise of their size.
         usual = scipy.stats.norm.isf(0.25 / noise.size)
-        level = max(np.sqrt(np.mean(square[1:]) / len(z)), float(np.abs(noise).max()) / usual)
+        level = max(np.sqrt(max(square[0], np.mean(square[1:])) / len(z)), float(np.abs(noise).max()) / usual)
         p = min(1.0, len(z) * 2 * float(scipy.stats.norm.sf(abs(z[largest]) / level)))
         found.append(FitTest(name, "outlier", p, f"{name}: an outlier at {one.t[used[largest]]:.2f} s"))
     return found

@@ -90,7 +90,7 @@ def evaluate(
     h, H, weight, D, reading_slopes, beat_inflation = predict_readings(space, data, trajectory, u, X)
     h = h + lacking.reading_errors(trajectory.lacking, features, h.shape[1])
     residual = np.zeros_like(h) if exact else np.where(data.used > 0, data.reading - h, 0.0)
-    start = (trajectory.state[0] - guess) / initial_std(space)
+    start = (trajectory.state[0] - guess) / initial_std(space, data)
     return Evaluation(
         data,
         trajectory,
@@ -192,7 +192,7 @@ def linearise(space: StateSpace, at: Evaluation, guess: np.ndarray, X: np.ndarra
     scale, n_p, n_u, N = state_scale(space), len(X), data.torque.shape[1], len(trajectory.state)
     count = 1 + n_p + lacking.count + len(data.offset_sensors)
     S, (direct, columns) = at.H * scale, _direct_slopes(space, at, n_p)
-    std = initial_std(space) / scale
+    std = initial_std(space, data) / scale
     zero = np.zeros((1, space.n, space.n))
     sections = [parallel_smoother.combine(parallel_smoother.Elements(zero, np.diag(std**2)[None], zero))]
     elements, gains, inverses = [], [], []
@@ -315,19 +315,25 @@ INITIAL_SPEED_STD = 0.05  # [m/s, rad/s]
 INITIAL_ANGLE_STD = 0.1  # [rad, m]
 
 
-def initial_std(space: StateSpace) -> np.ndarray:
+def initial_std(space: StateSpace, data: Measurements) -> np.ndarray:
     """Return the standard deviation (n,) of the first state about the filtered log, in its unit."""
-    return np.where(
-        np.isfinite(space.initial_std),
-        space.initial_std,
-        np.where(is_speed(space), INITIAL_SPEED_STD, INITIAL_ANGLE_STD),
-    )
+    usual = np.where(is_speed(space), INITIAL_SPEED_STD, INITIAL_ANGLE_STD)
+    machine, coordinates = space.model.machine, space.model.coordinates
+    if machine.planar and (heading := machine.body[0].coordinates[2]) in coordinates:
+        usual = np.where(space.index == coordinates.index(heading), data.heading_std, usual)
+    return np.where(np.isfinite(space.initial_std), space.initial_std, usual)
 
 
 def is_speed(space: StateSpace) -> np.ndarray:
     """Tell which states (n,) are velocities."""
     n_q = len(space.model.coordinates)
     return (space.index >= n_q) & (space.index < 2 * n_q)
+
+
+def is_turning(space: StateSpace) -> np.ndarray:
+    """Tell which states (n,) are angles of the heading or of a joint that turns."""
+    angles = [k for k, c in enumerate(space.model.coordinates) if c.startswith("theta")]
+    return np.isin(space.index, angles)
 
 
 def state_scale(space: StateSpace) -> np.ndarray:

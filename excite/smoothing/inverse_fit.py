@@ -26,6 +26,7 @@ from excite.smoothing.inverse import (
 from excite.smoothing.inverse_chain import Chain, TorqueModel, build_chain, torque_sensors
 from excite.smoothing.inverse_sizes import correlation_factor, update_sizes
 from excite.smoothing.log_fit import HELD_STD, NotConvergedError, held_in_turn, prior_information, prior_terms
+from excite.smoothing.measurements import LEAST_TORQUE_SHARE, root_mean_square
 from excite.smoothing.motion_readings import (
     JointMotion,
     Readings,
@@ -35,7 +36,6 @@ from excite.smoothing.motion_readings import (
     speed_std,
 )
 
-LEAST_NOISE_SHARE = 1e-3  # of the torque's root mean square; no sensor is better
 EXACT_PASSES = 15  # for the model alone, before discrepancies are tried; fewer if it settles; chosen
 ADMITTING = (0, 3, 6)  # passes after these in which discrepancies of zero size are tried
 SHOWN_SHARE = 0.6  # of the noise by third differences, to which a lively torque adds
@@ -229,9 +229,8 @@ def least_noise(model: Model, logs: Sequence[Log]) -> np.ndarray:
     """
     found = []
     for sensor in torque_sensors(model):
-        rms = np.sqrt(np.mean(np.concatenate([log.values[sensor.name] for log in logs]) ** 2))
         shown = np.median([white_noise(log.readings(sensor.name)) for log in logs])
-        found.append(max(LEAST_NOISE_SHARE * rms, SHOWN_SHARE * shown, 1e-12))
+        found.append(max(LEAST_TORQUE_SHARE * root_mean_square(logs, sensor), SHOWN_SHARE * shown, 1e-12))
     return np.array(found)
 
 

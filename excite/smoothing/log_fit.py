@@ -31,6 +31,7 @@ ACCEPTABLE_STEP = 1.0  # [standard deviations] next step of a fit that may be co
 DEFAULT = Settings()
 PENALTY = 1.5  # weight of a defect over its multiplier; an exact penalty needs more than 1
 LEAST_PENALTY = 0.05  # weight of a defect over the largest multiplier of its state
+MAX_TURN = 0.5  # [rad] of a joint in one pass: sines and cosines are not straight beyond
 MAX_RELATIVE_DECREASE = 0.8  # of a positive parameter in one pass, relative to its value
 LEAST_INERTIA = 1e-3  # share of the machine file's inertia that an estimate may have; chosen
 SETTLING_PASSES = 3  # until the states fit the dynamics well enough to judge which parameters are identifiable
@@ -318,8 +319,11 @@ class LogProblem:
             cost += e.cost + float(np.sum(weight * np.abs(e.defect / scale)))
         return cost
 
-    def moved(self, step: np.ndarray) -> Callable[[float], Point]:
-        """Return the path from the current point to the one after a step, with its most likely states."""
+    def moved(self, step: np.ndarray) -> tuple[Callable[[float], Point], float]:
+        """Return the path from the current point to the one after a step, with its most likely states.
+
+        No joint turns farther than MAX_TURN from the trajectory at which the logs were linearised.
+        """
         here, X = self.point, self.point.X + step[: len(self.prior)] * self.space.model.scale
         there = tuple(
             forward.move(self.space, trajectory, log, lacking, step[own], X, data)
@@ -334,7 +338,12 @@ class LogProblem:
             between = (forward.interpolate(a, b, fraction) for a, b in zip(here.trajectories, there, strict=True))
             return Point(here.X + fraction * (X - here.X), tuple(between))
 
-        return path
+        turns = forward.is_turning(self.space)
+        farthest = max(
+            float(np.abs(a.state - b.state)[:, turns].max(initial=0.0))
+            for a, b in zip(here.trajectories, there, strict=True)
+        )
+        return path, min(1.0, MAX_TURN / max(farthest, MAX_TURN))
 
 
 def fit_logs(

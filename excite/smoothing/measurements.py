@@ -20,6 +20,10 @@ from excite.text import format_number
 
 # Smallest standard deviation of an encoder edge [counts]: the division error of a good encoder. Without it, slow
 # passages, whose edges are timed exactly, would outweigh everything else.
+LEAST_SENSOR_SHARE = 1e-6  # noise over a signal's range, at least: what integration and rounding leave
+LEAST_TORQUE_SHARE = 1e-3  # noise of a torque over its root mean square, at least; no sensor is better
+REFERENCE_HEADING_STD = 0.1  # [rad] of a heading from which others count
+UNKNOWN_HEADING_STD = float(np.pi / np.sqrt(3))  # [rad] of one that may be any, between half a turn either way
 EDGE_STD = 0.1
 LEAST_GROUND_SPEED = 5.0  # speed over ground from which a reading is used [standard deviations]; chosen
 BEAT_HZ = 3.0  # a beat below this frequency is as slow as the machine's motion [Hz]; chosen
@@ -50,6 +54,7 @@ class Measurements:
         directions are biased by half a standard deviation or more.
     extra_torque_noise (N - 1, n_u) [N m]: standard deviation that the delivered torque of an interval has beside the
         sensor's noise, or None.
+    heading_std [rad]: of the first heading, from zero, where no sensor tells it.
     """
 
     torque: np.ndarray
@@ -60,6 +65,7 @@ class Measurements:
     noise: SensorNoise
     unbiased: bool = False
     extra_torque_noise: np.ndarray | None = None
+    heading_std: float = UNKNOWN_HEADING_STD
 
     def until(self, samples: int) -> Measurements:
         """The first samples only."""
@@ -133,7 +139,8 @@ def prepare_measurements(space: StateSpace, log: Log, unbiased: bool = False) ->
         used[:, j] = there
         if count_size is None:
             found = white_noise(log.readings(sensor.name))
-            sigma[j] = max(found, sensor.least_noise, 1e-9 + 1e-3 * noise_of(model.machine, sensor))
+            least = 1e-3 * noise_of(model.machine, sensor) or LEAST_SENSOR_SHARE * float(np.ptp(value))
+            sigma[j] = max(found, sensor.least_noise, 1e-9 + least)
             if sensor.kind == "ground_speed":  # near standstill noise has no sign, and the mean reading is above zero
                 used[:, j] &= value > LEAST_GROUND_SPEED * sigma[j]
             continue
@@ -158,7 +165,7 @@ def prepare_measurements(space: StateSpace, log: Log, unbiased: bool = False) ->
             np.sqrt(k)
             * max(
                 log.noise.get(s.name) or white_noise(log.readings(s.name)),
-                1e-3 * (noise_of(model.machine, s) or min(np.ptp(log.readings(s.name)), 1) or 1),
+                1e-3 * noise_of(model.machine, s) or LEAST_TORQUE_SHARE * root_mean_square([log], s) or 1e-3,
             )
             for k, s in zip(rows_per_reading, torques, strict=True)
         ]
@@ -179,6 +186,11 @@ def encoders_with_offset(space: StateSpace, read_at_edges: np.ndarray) -> tuple[
     return tuple(j for j in range(len(read_at_edges)) if read_at_edges[j] and space.angle_state[j] < space.core)
 
 
+def root_mean_square(logs: Sequence[Log], sensor: Sensor) -> float:
+    """Return the root mean square [SI] of a sensor's readings in all logs."""
+    return float(np.sqrt(np.mean(np.concatenate([log.values[sensor.name] for log in logs]) ** 2)))
+
+
 def torque_sensor(model: Model, body: int) -> Sensor:
     return next(s for s in model.machine.sensor if s.kind == "torque" and s.body == body)
 
@@ -192,9 +204,11 @@ def prepare_logs(
 ) -> tuple[tuple[Measurements, ...], tuple[Trajectory, ...]]:
     """Prepare logs for fits: their measurements, and trajectories to begin with.
 
-    unbiased: see `prepare_measurements`. extra_torque_noise: of each log, see `Measurements`.
+    The heading begins at zero in the first log, and at any angle in the others, as nobody logs how a machine was turned
+    between them. unbiased: see `prepare_measurements`. extra_torque_noise: of each log, see `Measurements`.
     """
-    measurements = tuple(prepare_measurements(space, log, unbiased) for log in logs)
+    first, *others = (prepare_measurements(space, log, unbiased) for log in logs)
+    measurements = (replace(first, heading_std=REFERENCE_HEADING_STD), *others)
     if extra_torque_noise is not None:
         noisy = zip(measurements, extra_torque_noise, strict=True)
         measurements = tuple(replace(r, extra_torque_noise=x) for r, x in noisy)

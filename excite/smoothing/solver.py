@@ -84,8 +84,11 @@ class Problem(Protocol[Point]):
     def merit(self) -> float:
         """Return the merit of the current point."""
 
-    def moved(self, step: np.ndarray) -> Callable[[float], Point]:
-        """Return the path from the current point: fraction of the step (n,) -> point."""
+    def moved(self, step: np.ndarray) -> tuple[Callable[[float], Point], float]:
+        """Return the path from the current point, fraction of the step (n,) -> point, and the largest fraction.
+
+        Beyond that fraction the linearisation holds no more, whatever the merit there.
+        """
 
 
 @dataclass(frozen=True)
@@ -132,14 +135,14 @@ def minimise(problem: Problem[Point], start: Point, settings: Settings) -> Solut
             break
         step = undamped if damping == 0 else found.step(damping)
         problem.weigh(step)
-        before, path = problem.merit(), problem.moved(step)
+        before, (path, largest) = problem.merit(), problem.moved(step)
         predicted = before - found.value(step)
         if not found.free.any():
             length = float(np.sqrt(max(predicted, 0.0)))
         if length < settings.tolerance and predicted < MERIT_ROUNDING * before:
             status = "converged"
             break
-        fraction, merit = _descend(problem, path, before, predicted, settings)
+        fraction, merit = _descend(problem, path, largest, before, predicted, settings)
         if fraction == 0.0:
             problem.enter(point)
             if length < STALLED_STEP or damping > MAX_DAMPING:
@@ -151,7 +154,7 @@ def minimise(problem: Problem[Point], start: Point, settings: Settings) -> Solut
         history.append((before, merit))
         point = path(fraction)
         little = before - merit < SLOW_DECREASE * before
-        slow = slow + 1 if fraction < 1.0 and little else 0
+        slow = slow + 1 if fraction < largest and little else 0
         if slow == SLOW_STEPS and length > SLOW_LENGTH:
             status = "stopped"
             break
@@ -160,7 +163,7 @@ def minimise(problem: Problem[Point], start: Point, settings: Settings) -> Solut
             if length < settings.tolerance:
                 status = "converged"
                 break
-        elif fraction < 0.3:
+        elif fraction < 0.3 * largest:
             damping = max(damping, 1.0) * np.sqrt(INCREASE)
     return Solution(point, status, found, cost, length, tuple(history))
 
@@ -175,10 +178,17 @@ MAX_DAMPING = 1e8  # information of a parameter known to 1e-4 of its scale
 
 
 def _descend(
-    problem: Problem[Point], path: Callable[[float], Point], before: float, predicted: float, settings: Settings
+    problem: Problem[Point],
+    path: Callable[[float], Point],
+    fraction: float,
+    before: float,
+    predicted: float,
+    settings: Settings,
 ) -> tuple[float, float]:
-    """Return the largest tried fraction of a step that lowers the merit, with the merit there; zero if none does."""
-    fraction = 1.0
+    """Return the largest tried fraction of a step that lowers the merit, with the merit there; zero if none does.
+
+    fraction: the first to be tried.
+    """
     for _ in range(settings.halvings):
         merit = problem.merit() if problem.enter(path(fraction)) else np.inf
         if merit <= before - settings.sufficient_decrease * fraction * max(predicted, 0.0):

@@ -526,3 +526,25 @@ def test_a_design_that_is_played_back_has_intervals_that_hold(va12: Model) -> No
     share = np.mean(inside, axis=0)
     assert 0.89 < share.mean() <= 1
     assert share.min() >= 0.6  # of 22 parameters, many of which are off together
+
+
+def test_logs_that_begin_turned_against_each_other_share_one_slope(va12: Model, va12_motion: Motion) -> None:
+    """No sensor tells the second heading: by 2.7 rad, which is farther than a slope is straight in it."""
+    entry = placing.parse_effect("ground_slope=0.003", va12.machine, 60.0)
+    sloping = prediction.build(placing.with_effects(va12.machine, entry), fit_shapes=True)
+    logs = []
+    for seed, turned in enumerate((0.0, 2.7)):
+        q0 = va12_motion.q[0].copy()
+        q0[va12.coordinates.index("theta0")] = turned
+        motion = simulate(sloping, va12_motion.u[:2501], q0=q0)
+        logs.append(make_log(sloping, motion, seed=seed, known=va12))
+    space = build_state_space(sloping, common_sensors(sloping, logs), True)
+    measurements, starts = smoothing.prepare_logs(space, logs, va12.machine.filter)
+    held = np.zeros(len(sloping.nominal), bool)
+    found = fit_logs(space, measurements, starts, sloping.nominal, starts, held)
+
+    assert found.status == "converged"
+    turn = np.flatnonzero(space.index == sloping.coordinates.index("theta0"))
+    first, second = (float(t.state[0][turn][0]) for t in found.trajectories)
+    assert np.angle(np.exp(1j * (second - first))) == pytest.approx(2.7, abs=0.1)
+    assert found.cost < 1.03 * sum(r.used.sum() for r in measurements)

@@ -56,9 +56,9 @@ class Residuals:
     def merit(self) -> float:
         return float(self.found @ self.found)
 
-    def moved(self, step: np.ndarray) -> Callable[[float], np.ndarray]:
+    def moved(self, step: np.ndarray) -> tuple[Callable[[float], np.ndarray], float]:
         here = self.point
-        return lambda fraction: here + fraction * step
+        return lambda fraction: here + fraction * step, 1.0
 
 
 def rosenbrock() -> Residuals:
@@ -128,9 +128,9 @@ class Growth:
         cost = np.sum((self.x - self.measured) ** 2) / self.noise**2
         return float(cost + self.weight @ np.abs(self.defect))
 
-    def moved(self, step: np.ndarray) -> Callable[[float], tuple[float, np.ndarray]]:
+    def moved(self, step: np.ndarray) -> tuple[Callable[[float], tuple[float, np.ndarray]], float]:
         p, x, change = self.p, self.x, self.constant + self.ways @ step
-        return lambda fraction: (p + fraction * step[0], x + fraction * change)
+        return lambda fraction: (p + fraction * step[0], x + fraction * change), 1.0
 
 
 def grow(p: float, first: float, n: int) -> np.ndarray:

@@ -131,8 +131,9 @@ def lively(model: Model, rng: np.random.Generator) -> Motion:
             for _ in model.coordinates
         ]
     )
-    nu = np.gradient(q, t, axis=1)
-    u = inverse_dynamics(model)(q, nu, np.gradient(nu, t, axis=1), model.nominal).full().T
+    course = scipy.interpolate.make_interp_spline(t, q, k=7, axis=1)
+    nu, a = course(t, 1), course(t, 2)
+    u = inverse_dynamics(model)(q, nu, a, model.nominal).full().T
     return follow_positions(model, u, q.T, nu.T)
 
 

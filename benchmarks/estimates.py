@@ -1,0 +1,179 @@
+"""Identify many logs, real and simulated, by the default method, and tell how each search for the estimate ended.
+
+    python benchmarks/estimates.py                     every log that is there (shared cases and data beside the tree)
+    python benchmarks/estimates.py --only emps --jobs 2
+
+Of each log: status of the estimate, and of each fit within it how it ended, its passes, and those in which an accepted
+merit rose, which must be none.
+"""
+
+from __future__ import annotations
+
+# ruff: noqa: E402  (threads are set before numpy loads)
+import argparse
+import json
+import os
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import numpy as np
+from joblib import Parallel, delayed
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+from support.damaged_logs import damaged, lively, machine_model
+from support.several import STRAIGHT, draw
+
+import excite
+from excite.errors import ExciteError
+from excite.logs.log import table_of
+from excite.simulation import measure
+from excite.smoothing import inverse_fit, solver
+
+SHARED = ROOT.parent / "shared"
+CASES, DATA = SHARED / "cases", SHARED / "data"
+Source = Callable[[], tuple[Any, Any]]  # machine and logs
+
+
+def real_logs() -> dict[str, Source]:
+    """Logs of real machines, and cases made after such."""
+    found: dict[str, Source] = {}
+
+    def add(name: str, machine: str | Path, *logs: str) -> None:
+        paths = [DATA / log for log in logs]
+        if all(p.is_file() for p in paths):
+            found[name] = lambda: (machine, paths)
+
+    add("emps", "emps", "emps/DATA_EMPS.mat")
+    add("rack", "rack", "rack_and_pinion/force_2kHz.csv", "rack_and_pinion/speed_1500Hz.csv")
+    add("pendulum", "pendulum", "dfki_pendulum/data_measured.csv")
+    add("panda", "panda", "franka_panda/exciting_trajectory_1.csv")
+    add("light_ev", ROOT / "docs" / "examples" / "light_ev.toml", "light_ev/drive.csv")
+    for log in ("20_02_12-50sec_12harm", "20_02_19_14harm50sec", "20_02_19_15harm50sec"):
+        add(f"ur10e {log[6:8]}.{log[3:5]} {log[9:16]}", "ur10e", f"ur10e/{log}.csv")
+    for log in (143339, 143601, 143747):
+        add(f"double pendulum {log}", DATA / "double_pendulum" / "acrobot.urdf", f"double_pendulum/{log}.csv")
+    if "emps" in found:
+        for half in (0, 1):
+            found[f"emps, half {half + 1}"] = lambda half=half: ("emps", [_half_of_emps(half)])
+    for case, machine, logs in (
+        ("G01_valid_over_misfit", "rig.toml", ("rig.csv", "abs_0.3.csv", "shift_-0.05.csv")),
+        ("G03_clean_but_biased", "rig.toml", ("rig.csv",)),
+        ("G03_clean_but_biased", "two_joints.toml", ("two4.csv",)),
+        ("G04_moving_at_edges", "pend_drop.toml", ("pend_moving_edges.csv",)),
+        ("G06_plateaus", "rig.toml", ("cv_plateaus.csv",)),
+        ("G17_late_torque", "va12_straight", ("both_30ms.csv.gz", "front_30ms.csv.gz")),
+        ("D1_sticking_rig", "emps", ("d_clean_100.mat", "d_strib_102.mat")),
+        ("C1_speed_only_rig", "rpm.toml", ("rpm.csv",)),
+    ):
+        folder = CASES / case
+        for log in logs:
+            if (folder / log).is_file():
+                own = folder / machine if machine.endswith(".toml") else machine
+                found[f"{case[:3].strip('_')} {log}"] = lambda own=own, path=folder / log: (own, [path])
+    return found
+
+
+def _half_of_emps(half: int) -> Any:
+    table = table_of(DATA / "emps" / "DATA_EMPS.mat", excite.load("emps").machine)
+    count = len(table) // 2
+    return table.iloc[half * count : (half + 1) * count].reset_index(drop=True)
+
+
+def simulated_logs() -> dict[str, Source]:
+    """Clean logs of rollers, worlds with several effects, and damaged logs of rigs."""
+    found: dict[str, Source] = {}
+    for machine, drive in (("va12", "R60"), ("va12", "R60_accuracy"), ("va12_straight", "S40")):
+        design = str(ROOT / "results" / drive / "design")
+        found[f"{machine} {drive}, clean"] = lambda m=machine, d=design: (m, [excite.simulate(m, d, seed=1)])
+    straight = str(ROOT / "results" / "S40" / "design")
+    for seed in range(4):
+        effects = draw(seed, STRAIGHT)
+        found[f"va12_straight, several effects {seed}"] = lambda s=seed, e=effects: (
+            "va12_straight",
+            [excite.simulate("va12_straight", straight, seed=s, effects=e)],
+        )
+    drives = [str(ROOT / "results" / d / "design") for d in ("R60_accuracy", "R60")]
+    for seed in range(2):
+        found[f"va12, several effects {seed}"] = lambda s=seed: (
+            "va12",
+            [excite.simulate("va12", d, seed=s + k, effects=draw(s)) for k, d in enumerate(drives)],
+        )
+    for name in ("rig", "two_joints"):
+        for seed in range(5):
+            found[f"{name}, damaged {seed}"] = lambda name=name, seed=seed: _damaged_log(name, seed)
+    return found
+
+
+def _damaged_log(name: str, seed: int) -> tuple[Any, Any]:
+    model, rng = machine_model(name), np.random.default_rng([seed, 0])
+    table, _ = damaged(measure(model, lively(model, rng), seed=seed), model, rng)
+    return model, [table]
+
+
+def identify(name: str, source: Source) -> dict[str, Any]:
+    """Identify one log by the default method; return how the fits within ended."""
+    ends, rises, passes = Counter[str](), 0, 0
+    minimise, conclude = solver.minimise, inverse_fit.conclude
+
+    def watched(*given: Any) -> Any:
+        nonlocal rises, passes
+        found = minimise(*given)
+        ends[found.status] += 1
+        passes += len(found.history)
+        rises += sum(after > before for before, after in found.history)
+        return found
+
+    def concluded(state: Any, held: Any, status: str, costs: Any, step: float) -> Any:
+        nonlocal rises, passes
+        ends[status] += 1
+        passes += len(costs)
+        rises += sum(after > before for before, after in costs)
+        return conclude(state, held, status, costs, step)
+
+    machine, logs = source()
+    begin, cpu = time.monotonic(), time.process_time()
+    solver.minimise, inverse_fit.conclude = watched, concluded
+    try:
+        found = excite.identify(machine, logs)
+        said = {"method": found.method, "status": found.status, "doubt": found.doubt}
+    except ExciteError as err:
+        said = {"method": "", "status": "refused", "doubt": str(err)}
+    finally:
+        solver.minimise, inverse_fit.conclude = minimise, conclude
+    spent = {"s": time.monotonic() - begin, "cpu_s": time.process_time() - cpu}
+    return {"log": name, **said, "ends": dict(ends), "passes": passes, "rises": rises, **spent}
+
+
+def main() -> None:
+    """Run the bench."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="", help="logs with this in their names")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--out", type=Path, help="write a line of JSON for each log")
+    given = parser.parse_args()
+    sources = {n: s for n, s in {**real_logs(), **simulated_logs()}.items() if given.only in n}
+    rows = []
+    for row in Parallel(n_jobs=given.jobs, return_as="generator")(delayed(identify)(*x) for x in sources.items()):
+        rows.append(row)
+        ends = ", ".join(f"{n} {end}" for end, n in row["ends"].items())
+        sys.stdout.write(
+            f"{row['log']}: {row['method']} {row['status']}, {row['s']:.0f} s ({row['cpu_s']:.0f} s of CPU); fits:"
+            f" {ends or 'none'}; {row['passes']} passes, {row['rises']} rising; {row['doubt'][:100]}\n"
+        )
+        sys.stdout.flush()
+    if given.out:
+        given.out.write_text("".join(json.dumps(r) + "\n" for r in rows), encoding="utf-8")
+    count = sum(row["passes"] for row in rows)
+    sys.stdout.write(f"{len(rows)} logs, {count} accepted passes, {sum(row['rises'] for row in rows)} of them rising\n")
+
+
+if __name__ == "__main__":
+    main()
