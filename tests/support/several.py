@@ -6,10 +6,12 @@ of the parameters, not the names of the effects.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 
 import excite
 
@@ -52,11 +54,52 @@ def draw(seed: int, names: Sequence[str] = tuple(USUAL)) -> tuple[str, ...]:
     return tuple(found)
 
 
+def simulated(machine: str, drives: Sequence[str], effects: Sequence[str], seed: int) -> list[pd.DataFrame]:
+    """Simulate a log along each drive with the effects."""
+    return [excite.simulate(machine, drive, seed=seed + k, effects=effects) for k, drive in enumerate(drives)]
+
+
 def judge(machine: str, drives: Sequence[str], effects: Sequence[str], seed: int) -> Judged:
-    """Simulate a log along each drive with the effects, identify from all, and compare with the true values."""
-    logs = [excite.simulate(machine, drive, seed=seed + k, effects=effects) for k, drive in enumerate(drives)]
+    """Identify from a log along each drive, and compare with the true values."""
+    logs = simulated(machine, drives, effects, seed)
     found, true = excite.identify(machine, logs), excite.load(machine).nominal
     error = found.value - true
     return Judged(
         tuple(effects), found.status, float(100 * error[0] / true[0]), error / found.std, error / found.std_total
     )
+
+
+@dataclass(frozen=True)
+class Named:
+    """Diagnosis of one world: verdict, names that are right (also in a tie), of the right kind elsewhere, and wrong.
+
+    z (n,): deviations of the parameters from the true values after mending. wall_s [s]: of the whole diagnosis.
+    """
+
+    effects: tuple[str, ...]
+    verdict: str
+    right: tuple[str, ...]
+    elsewhere: tuple[str, ...]
+    wrong: tuple[str, ...]
+    mass_error_percent: float
+    z: np.ndarray
+    wall_s: float
+
+
+def judge_names(machine: str, drives: Sequence[str], effects: Sequence[str], seed: int) -> Named:
+    """Diagnose a log along each drive, and compare names and mended parameters with the truth."""
+    logs = simulated(machine, drives, effects, seed)
+    begin = time.monotonic()
+    found = excite.diagnose(machine, logs).diagnosis
+    wall = time.monotonic() - begin
+    true, names = excite.load(machine).nominal, {e.partition("=")[0] for e in effects}
+    kinds = {n.partition("@")[0] for n in names}
+    groups: dict[str, list[str]] = {"right": [], "elsewhere": [], "wrong": []}
+    for f in found.findings:
+        right = names & {f.name, *f.tied_with}
+        groups["right" if right else "elsewhere" if f.effect in kinds else "wrong"].append(f.name)
+    after = np.array([p.after for p in found.parameters])
+    std = np.array([p.std_after for p in found.parameters])
+    mass = float(100 * (after[0] / true[0] - 1))
+    told = {key: tuple(own) for key, own in groups.items()}
+    return Named(tuple(effects), found.verdict, **told, mass_error_percent=mass, z=(after - true) / std, wall_s=wall)
