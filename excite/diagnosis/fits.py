@@ -307,11 +307,16 @@ Fitted = tuple[Fit, tuple[Measurements, ...]]
 
 
 def _follow(
-    data: FitData, trajectories: Sequence[Trajectory], X: np.ndarray, settings: Settings, most: float | None = None
+    data: FitData,
+    trajectories: Sequence[Trajectory],
+    X: np.ndarray,
+    settings: Settings,
+    most: float | None = None,
+    before: ExtendedFit | None = None,
 ) -> Fitted:
     """Fit exact dynamics, or beside unknown forces if these do not follow the logs. Raises NotConvergedError.
 
-    most: cost from which a fit is given up that has nothing beside the model.
+    most: cost from which a fit is given up that has nothing beside the model. before: a fit that this one continues.
     """
     limit = (LOST_COST_RATIO if settings is RESUMED else TRACKING_COST_RATIO) * data.n_readings
     lost = (TRACKING_COST_RATIO if settings is COMPARED else LOST_COST_RATIO) * data.n_readings
@@ -330,8 +335,10 @@ def _follow(
         return without_smoother_levels(fit), data.measurements
     if most is not None:
         raise NotConvergedError("exact dynamics do not follow the logs")
+    known = None if before is None or before.exact else smoothing.FitBeside(before.fit, before.measurements)
+    rounds = ROUNDS_BESIDE if known is None else ROUNDS_BESIDE[-1:]
     beside = smoothing.fit_unknown_forces(
-        data.space, data.measurements, data.starts, data.held, ROUNDS_BESIDE, True, (X, trajectories)
+        data.space, data.measurements, data.starts, data.held, rounds, True, (X, trajectories), known
     )
     if not beside.fit.linear:
         beside.fit.required()
@@ -355,7 +362,7 @@ def _continued(machine: Machine, previous: ExtendedFit) -> tuple[FitData, list[T
 def refit(machine: Machine, previous: ExtendedFit) -> ExtendedFit:
     """Fit a machine with other effects to the same logs, from a previous fit. Raises NotConvergedError."""
     data, along, X = _continued(machine, previous)
-    return ExtendedFit(machine, data, *_follow(data, along, X, RESUMED))
+    return ExtendedFit(machine, data, *_follow(data, along, X, RESUMED, before=previous))
 
 
 def refit_all(

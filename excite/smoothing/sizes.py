@@ -59,23 +59,30 @@ def fit_unknown_forces(
     rounds: Sequence[Settings] = ROUNDS,
     named: bool = False,
     first: tuple[np.ndarray, Sequence[Trajectory]] | None = None,
+    before: FitBeside | None = None,
 ) -> FitBeside:
     """Fit logs with what the model lacks, its sizes found.
 
     rounds: settings of each. named: only shapes that effects of the catalogue have, which takes a quarter of the time
-    and follows the logs as well. first: parameters (n_base,) and trajectories to begin with.
+    and follows the logs as well. first: parameters (n_base,) and trajectories to begin with. before: a fit of a similar
+    model to the same logs, whose sizes are good ones to begin with.
     """
     model, n_u = space.model, len(space.model.inputs)
     white = np.array([FIRST_FORCE_STD * (kind in FORCES) for _, kind in space.forces])
     X, trajectories = (model.nominal, tuple(starts)) if first is None else (first[0], tuple(first[1]))
     size, inflation, logs, pull = None, np.ones(n_u), tuple(measurements), None
+    known = dict[str, float]()
+    if before is not None:
+        known = dict(zip((g.name for g in before.fit.unknown.groups), before.fit.unknown.size, strict=True))
+        white, logs = before.fit.unknown.lacking[0].force_std, _with_torque_noise(logs, before.measurements)
+        inflation = np.square(logs[0].noise.torque / measurements[0].noise.torque)
     fit: Fit | None = None
     for k, settings in enumerate(rounds):
         unknown = catalogue(space, list(zip(logs, trajectories, strict=True)), X, white, True if named else None)
         if size is None:
             trajectories = _without_coefficients(trajectories, unknown)
-        else:
-            unknown = replace(unknown, size=size)
+            size = np.array([known.get(g.name, x) for g, x in zip(unknown.groups, unknown.size, strict=True)])
+        unknown = replace(unknown, size=size)
         latest = fit_logs(space, logs, trajectories, X, starts, held, settings=settings, unknown=unknown, pull=pull)
         lost = not (latest.linear and latest.cost > 0) or any(t.force_error is None for t in latest.trajectories)
         fit = latest if fit is None or not lost else fit
@@ -94,6 +101,12 @@ def fit_unknown_forces(
     assert fit is not None
     spread = clustered_inflation(fit, float(model.machine.sampling_hz)) if fit.linear else np.ones(len(fit.X))
     return FitBeside(replace(fit, covariance=fit.covariance * np.outer(spread, spread)), logs)
+
+
+def _with_torque_noise(logs: Sequence[Measurements], before: Sequence[Measurements]) -> tuple[Measurements, ...]:
+    """Return logs with the noise of torques that a fit before left."""
+    noises = (replace(a.noise, torque=b.noise.torque) for a, b in zip(logs, before, strict=True))
+    return tuple(replace(a, noise=noise) for a, noise in zip(logs, noises, strict=True))
 
 
 AVERAGED_SCATTER = 1.5  # of the logarithm of a size about the level of all; chosen, wider than where sizes are sought

@@ -158,27 +158,19 @@ def test_other_machines_are_told_in_their_own_words(emps: Model) -> None:
     assert "carriage" in told
 
 
-@pytest.mark.parametrize(
-    "method",
-    [
-        "ols",
-        "joint",
-        pytest.param(
-            "inverse",
-            marks=pytest.mark.xfail(
-                reason="a smooth motion rounds the corner where the drive begins, on some processors"
-            ),
-        ),
-    ],
-)
+@pytest.mark.parametrize("method", ["ols", "joint", "inverse"])
 def test_what_moves_together_is_named_with_the_combination_that_is_known(emps: Model, method: str) -> None:
     """Pushed one way only, dry friction and offset are one constant force: 17.23 N on this rig."""
     t = np.arange(0, 4, 1e-3)
     motion = simulate(emps, (60 + 40 * np.sin(2 * np.pi * 1.3 * t))[:, None])
     estimate = methods.identify(emps, [make_log(emps, motion, seed=1)], method)
+    truth = float(emps.nominal[2] + emps.nominal[3])
+    if method == "inverse" and not estimate.unidentifiable:  # told by where the drive begins, on some processors
+        variance = estimate.covariance[2:, 2:].sum()
+        assert abs(estimate.value[2:].sum() - truth) < max(3 * np.sqrt(variance), 0.05)
+        return
     reason = estimate.unidentifiable["offset"]
     assert "this log shows it only together with others: Fc + offset = " in reason
     value, deviation = (float(x) for x in reason.split("= ")[1].split(" N;")[0].split(" +- "))
-    truth = float(emps.nominal[2] + emps.nominal[3])
     assert abs(value - truth) < max(3 * deviation, 0.05)
     assert "both ways" in reason

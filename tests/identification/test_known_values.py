@@ -44,17 +44,15 @@ def both_ways() -> pd.DataFrame:
 OFFSET = '[body.carriage.friction]\nu0 = { value = -3.1648, source = "measured", known = true }\n'
 
 
-CORNER = pytest.mark.xfail(
-    reason="a smooth motion rounds the corner that dry friction makes where the drive begins, and tells it from offset,"
-    " on some processors",
-)
-
-
-@pytest.mark.parametrize("method", ["ols", "joint", pytest.param("inverse", marks=CORNER)])
+@pytest.mark.parametrize("method", ["ols", "joint", "inverse"])
 def test_known_offset_makes_dry_friction_identifiable(tmp_path: Path, one_way: pd.DataFrame, method: str) -> None:
     emps = build(load_machine("emps"))
     without = excite.identify("emps", one_way, method)
-    assert {"Fc", "offset"} & set(without.unidentifiable)
+    if method == "inverse" and not without.unidentifiable:  # told by where the drive begins, on some processors
+        force, variance = without.value[2:].sum(), without.covariance[2:, 2:].sum()
+        assert abs(force - emps.nominal[2:].sum()) < max(3 * np.sqrt(variance), 0.05)
+    else:
+        assert {"Fc", "offset"} & set(without.unidentifiable)
     found = excite.identify(machine_file(tmp_path, OFFSET), one_way, method)
     assert not found.unidentifiable
     k = found.names.index("Fc")
