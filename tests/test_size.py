@@ -11,8 +11,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "lines": 58_521,
-    "named constants": 815,
+    "lines": 58_587,
+    "named constants": 811,
     "files over 600 lines": 0,
     "functions over 80 lines": 4,
     "functions with more than 8 parameters": 15,

@@ -13,6 +13,7 @@ import numpy as np
 
 from excite.errors import LogError
 from excite.logs import clocks, log
+from excite.logs.files.common import SHOWN
 from excite.logs.filtered import derivative, lowpass, too_slow
 from excite.logs.outliers import dropouts, dropouts_of, ends_of_range, one_count, spikes
 from excite.logs.plausibility import RATES, against, as_speed, is_speed, own_file, rated_speed, step_of, unchanging
@@ -21,7 +22,6 @@ from excite.logs.resampling import BRIDGED_STEPS, held_every
 from excite.model.machine import TURN, Machine, noise_of
 from excite.text import format_number
 
-SHOWN = 3  # places named of what is there many times
 FASTER = 1.5  # times what a joint can move in a step, beyond which it was not the joint that moved; chosen
 UNUSUAL = 10.0  # times the usual lead of a step over its neighbours; chosen
 SLIPPED = 8.0  # counts by which a step leads its neighbours that can be no noise; chosen

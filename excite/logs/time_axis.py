@@ -10,13 +10,13 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs.clocks import ROUNDED, goes_on, period_of, unrounded
+from excite.logs.files.common import SHOWN
 from excite.logs.times import DAY_S
 from excite.text import count, format_number
 
 HOUR_S = 3600.0  # [s] by which a clock is set for summer time
 SLACK_STEPS = 20.0  # steps by which a clock's jump may differ from a whole day or hour; chosen
 MIN_RUN_ROWS = 20  # rows that a part of a log must have to be a log of its own; chosen
-SHOWN = 3  # rows named of what is there many times
 GAP_STEPS = 10.0  # usual steps to the next row, from which a clock may have stood between; chosen
 SORTED_EVEN = 0.05  # relative deviation of steps up to which sorted rows count as even; chosen
 

@@ -17,14 +17,13 @@ from excite.errors import SimulationError, UndrivableError
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.operator import ground, page, sheet
-from excite.operator.ground import DriveQuality, Trace
+from excite.operator.ground import PEOPLE, DriveQuality, Trace
 from excite.operator.server import GrowingLog, serve_page
 from excite.operator.sheet import Sheet
 from excite.simulation import Motion
 from excite.text import format_number, format_percent
 from excite.trajectories import SavedDesign
 
-PEOPLE = 3  # simulated drivers; chosen
 PAGE = "driver.html"
 SECONDS_PER_PHASE = (4.0, 3.0, 2.5)  # mean lengths of phases to try if no number of phases is given [s]; chosen
 MAX_LOSS_RATIO = 1.2  # error product over the best one, up to which fewer phases are preferred; chosen

@@ -22,6 +22,7 @@ from excite.text import format_number
 
 BROKEN_SHARE = 0.02  # excess, as a share of a limit's range, from which the limit counts as broken; chosen
 GRID_S = 0.5  # [s]: phases begin at multiples of it; chosen
+PEOPLE = 3  # simulated drivers; chosen
 SPEED_STEP = 0.1  # [m/s]: what a person reads from a dial; chosen
 ANGLE_STEP = np.deg2rad(2)  # [rad]: what a person steers to; chosen
 LIMIT_SHARE = 0.93  # of speed and rate limits that a trace uses, as a person overshoots; chosen

@@ -25,11 +25,10 @@ from excite.errors import SimulationError, UndrivableError
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.operator import ground
-from excite.operator.ground import ANGLE_STEP, GRID_S, SPEED_STEP, DriveQuality, TouchedGround, Trace
+from excite.operator.ground import ANGLE_STEP, GRID_S, PEOPLE, SPEED_STEP, DriveQuality, TouchedGround, Trace
 from excite.simulation import STEADY_DRIVER, Motion, track_motion
 from excite.trajectories import CompositeObjective, Design, Limit, Manoeuvre, process_count
 
-PEOPLE = 3  # simulated people who drive the result; chosen
 MEAN_PHASE_RATIO = 1.3  # least mean length of a phase over the shortest one; chosen
 N_RANDOM = 16  # random traces beside the smoothed design; chosen
 RANDOM_STREAM = 4  # stream of random numbers of these traces

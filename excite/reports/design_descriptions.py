@@ -33,9 +33,8 @@ def describe_design(s: Summary) -> Description:
     """Describe a design: attainable accuracy, limits, condition numbers, advice."""
     sigma = s["sigma_percent"]
     worst = max(sigma, key=lambda n: sigma[n])
-    kept = s["max_violation"] <= TOLERANCE
     over = describe_violations(s.get("violations", {}), s.get("excesses")) or format_percent(100 * s["max_violation"])
-    limits = "every limit is kept" if kept else f"limits broken: {over}"
+    limits = f"limits broken: {over}" if s["max_violation"] > TOLERANCE else _kept(s["max_violation"])
     word = "motion" if s.get("trajectory") else "drive"
     driven = "Followed as designed" if s.get("trajectory") else "Driven as designed"
     driven = "Driven by a steady person" if s.get("driver") else driven
@@ -257,7 +256,7 @@ def describe_score(s: Summary) -> Description:
         shown = f"do not show {few}, whose error stays above {most}"
     over = describe_violations(s["violations"], s.get("excesses"))
     lasts = trajectories.DURATION_LIMIT in s.get("excesses", {})
-    limits = f"limits broken: {over}" if over else "every limit is kept"
+    limits = f"limits broken: {over}" if over else _kept(max(s["violations"].values(), default=0.0))
     worst = f"worst {s['worst_parameter']}"
     if hidden:
         worst += f" {format_percent(s['worst_percent'])}"
@@ -316,7 +315,13 @@ def _violations_table(s: Summary) -> tuple[Table, ...]:
         for name, value in s["violations"].items()
         if value >= SHOWN_VIOLATION
     )
-    return (Table("Limits that are exceeded.", ("limit", "by"), over),) if over else ()
+    within = "" if describe_violations(s["violations"]) else f", within the tolerance of {TOLERANCE:.1%}"
+    return (Table(f"Limits that are exceeded{within}.", ("limit", "by"), over),) if over else ()
+
+
+def _kept(excess: float) -> str:
+    """Say that limits are kept, and how far where the largest excess over one [share of its range] is shown."""
+    return "every limit is kept" + (f" to {TOLERANCE:.1%} of its range" if excess >= SHOWN_VIOLATION else "")
 
 
 WAYS_OF_DRIVING = {

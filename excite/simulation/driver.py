@@ -28,7 +28,7 @@ from excite.simulation.integrator import Motion, respond
 DRIVER_STREAM = 2  # stream of random numbers, independent of the sensors'
 RESPONSE_TIME = 0.3  # s, time constant of speed under a hydrostatic drive; chosen
 WALKING_SPEED = 1.0  # m/s, speed at which the resistance to steering is evaluated; chosen
-HOLDING_RATE = 5.0  # 1/s, rate at which steering cylinders return a joint pushed away by the soil; chosen
+HOLDING_RATE = 5.0  # 1/s, rate at which the angle error of a steered joint is corrected; chosen
 WANDER_TIME = 2.0  # s, both time constants of the slow errors; chosen
 WATCHED_SIGNALS = 2  # speed and one angle, for which the numbers of `Driver` hold
 NEUTRAL_SPEED = 0.2  # m/s, below which errors and corrections fade with the lever; chosen

@@ -10,11 +10,10 @@ import numpy as np
 
 from excite.model import JOINT_KEYS, Model
 from excite.model.machine import Body, Machine, Quantity
-from excite.simulation.driver import drive_gains
+from excite.simulation.driver import HOLDING_RATE, drive_gains
 from excite.simulation.integrator import Motion, respond
 
 SCENARIO_STREAM = 3  # stream of random numbers, independent of the others
-HOLDING_RATE = 5.0  # 1/s, rate at which the angle error of a steered joint is corrected; chosen
 GAIN_FACTOR = 5.0  # feedback gain over that of the driver model's drive; chosen
 
 

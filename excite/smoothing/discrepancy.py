@@ -14,11 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from excite.smoothing.motion_readings import LEAST_GAIN
+
 WITH_SPEED, WITH_POSITION, SLOW = "with speed", "with position", "slow"
 SPEED_NODES, POSITION_NODES, TIME_NODES = 7, 20, 6  # of a curve; finer structure counts as fast noise
 SPEED_SCALES, POSITION_SCALES, TIME_SCALES = (0.1, 1.0), (0.06, 0.5), (0.5,)  # of kernels, shares of the range
 MAX_UPDATES, FEW_UPDATES = 40, 5  # of sizes, for one quadratic form
-LEAST_GAIN = 1.0  # of log-likelihood by a size that is kept: one size costs as much (Akaike)
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,8 @@ from excite.text import format_number
 
 # Smallest standard deviation of an encoder edge [counts]: the division error of a good encoder. Without it, slow
 # passages, whose edges are timed exactly, would outweigh everything else.
-LEAST_SENSOR_SHARE = 1e-6  # noise over a signal's range, at least: what integration and rounding leave
+LEAST_SENSOR_SHARE = 1e-7  # noise over a signal's range, at least: what integration and rounding leave
 LEAST_TORQUE_SHARE = 1e-3  # noise of a torque over its root mean square, at least; no sensor is better
-REFERENCE_HEADING_STD = 0.1  # [rad] of a heading from which others count
-UNKNOWN_HEADING_STD = float(np.pi / np.sqrt(3))  # [rad] of one that may be any, between half a turn either way
 EDGE_STD = 0.1
 LEAST_GROUND_SPEED = 5.0  # speed over ground from which a reading is used [standard deviations]; chosen
 BEAT_HZ = 3.0  # a beat below this frequency is as slow as the machine's motion [Hz]; chosen
@@ -54,7 +52,7 @@ class Measurements:
         directions are biased by half a standard deviation or more.
     extra_torque_noise (N - 1, n_u) [N m]: standard deviation that the delivered torque of an interval has beside the
         sensor's noise, or None.
-    heading_std [rad]: of the first heading, from zero, where no sensor tells it.
+    turned: the first heading may be any, not about zero, where no sensor tells it.
     """
 
     torque: np.ndarray
@@ -65,7 +63,7 @@ class Measurements:
     noise: SensorNoise
     unbiased: bool = False
     extra_torque_noise: np.ndarray | None = None
-    heading_std: float = UNKNOWN_HEADING_STD
+    turned: bool = True
 
     def until(self, samples: int) -> Measurements:
         """The first samples only."""
@@ -208,7 +206,7 @@ def prepare_logs(
     between them. unbiased: see `prepare_measurements`. extra_torque_noise: of each log, see `Measurements`.
     """
     first, *others = (prepare_measurements(space, log, unbiased) for log in logs)
-    measurements = (replace(first, heading_std=REFERENCE_HEADING_STD), *others)
+    measurements = (replace(first, turned=False), *others)
     if extra_torque_noise is not None:
         noisy = zip(measurements, extra_torque_noise, strict=True)
         measurements = tuple(replace(r, extra_torque_noise=x) for r, x in noisy)

@@ -42,7 +42,7 @@ from excite.smoothing.splines import (
 START_RANGES = 10.0  # standard deviation of the first state, in ranges of the motion; wide enough to tell nothing
 MAX_UPDATES = 40  # of the sizes of motion and noise
 SETTLED = 0.02  # relative change of a size that ends them
-LEAST_GAIN = 1.0  # of log-likelihood by halving the step of the knots, that is worth it
+LEAST_GAIN = 1.0  # of log-likelihood by a size or a finer step that is kept: one more costs as much (Akaike)
 COARSEST_STEP = 0.1  # [s] from which knots are refined; machines move within less
 FINEST_SHARE = 0.75  # of the rows' distance, below which knots are not halved: two unknowns for two readings
 CONDITION = 1e7  # largest ratio of the prior's information to that of a reading; double precision

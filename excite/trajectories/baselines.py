@@ -45,7 +45,7 @@ from excite.trajectories.continuation import (
     evaluate_drive,
     typical_sizes,
 )
-from excite.trajectories.excitation import Manoeuvre, scale_torques
+from excite.trajectories.excitation import FADE, Manoeuvre, scale_torques
 from excite.trajectories.limits import (
     TOLERANCE,
     check_limits,
@@ -66,7 +66,6 @@ MAX_ATTEMPTS = 4  # attempts at the nearest feasible drive; chosen
 CONTINUATION = ((10.0, 3.0, 2), (3.0, 1.5, 1), (1.0, 1.0, 1))
 FUNDAMENTAL = 0.05  # Hz, of the Fourier series; one period in 20 s; chosen
 HARMONICS = 6  # of the Fourier series, up to 0.3 Hz; chosen
-FADE = 0.5  # s, fade of the Fourier series from and to zero torque; chosen
 FINITE_DIFFERENCE = 1e-4  # step of a Fourier coefficient, well above the integrator's error; chosen
 DESIGNED = "designed"  # name of the design's row
 

@@ -12,8 +12,8 @@ from scipy.interpolate import make_interp_spline
 from excite.model import Model
 from excite.simulation import Motion, motion_along
 from excite.trajectories.clearance import has_shapes, kept_pairs, pairs, tool_point
+from excite.trajectories.joint_motion import SPLINE_DEGREE
 
-SPLINE_DEGREE = 5  # as of the motions that are designed, so that their samples give them back
 NEAREST = 3  # pairs of things that are named, the nearest ones
 
 

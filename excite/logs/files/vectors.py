@@ -10,10 +10,9 @@ import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
-from excite.logs.files.common import NOTES, OTHER_NAMES, merged, refuse_huge
+from excite.logs.files.common import NOTES, OTHER_NAMES, SHOWN, merged, refuse_huge
 
 TIMES = ("time", "t", "timestamps")  # fields that are the time of their struct or group
-SHOWN = 3  # names that a message lists
 
 
 def one_table(
