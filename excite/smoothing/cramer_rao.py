@@ -65,9 +65,8 @@ def cramer_rao(
         np.array([_noise(model.machine, s) * factors.get(s.name, 1) for s in space.sensors]),
     )
     none = np.zeros((len(state), len(space.sensors)))
-    data = Measurements(
-        measured_torques(model, motion.t, motion.u, X), none, none, counts, encoders_with_offset(space, counts), noise
-    )
+    torque, offsets = measured_torques(model, motion.t, motion.u, X), encoders_with_offset(space, counts)
+    data = Measurements(torque, none, none, counts, offsets, noise, turned=False)
     trajectory = Trajectory(state, np.zeros_like(motion.u[1:]), np.zeros(len(data.offset_sensors)), over)
     data = with_mean_edge_rates(space, data, trajectory, motion.u, X)
     data = replace(data, used=data.used * _shares_read(space, state, noise, X))
