@@ -39,6 +39,7 @@ from excite.smoothing import inverse_fit, solver
 
 SHARED = ROOT.parent / "shared"
 CASES, DATA = SHARED / "cases", SHARED / "data"
+ROUNDING = 1e-10  # of a merit
 Source = Callable[[], tuple[Any, Any]]  # machine and logs
 
 
@@ -128,14 +129,14 @@ def identify(name: str, source: Source) -> dict[str, Any]:
         found = minimise(*given)
         ends[found.status] += 1
         passes += len(found.history)
-        rises += sum(after > before for before, after in found.history)
+        rises += sum(after - before > ROUNDING * abs(before) for before, after in found.history)
         return found
 
     def concluded(state: Any, held: Any, status: str, costs: Any, step: float) -> Any:
         nonlocal rises, passes
         ends[status] += 1
         passes += len(costs)
-        rises += sum(after > before for before, after in costs)
+        rises += sum(after - before > ROUNDING * abs(before) for before, after in costs)
         return conclude(state, held, status, costs, step)
 
     machine, logs = source()

@@ -26,6 +26,7 @@ from excite.text import count, format_number, format_percent
 from excite.trajectories import TOLERANCE
 
 MAX_CONDITION = 1e15  # condition number that is infinite but for rounding
+KEPT_TO = format_percent(100 * TOLERANCE)  # of a limit's range
 SHOWN_VIOLATION = 5e-6  # of a limit's range: smaller ones round to 0.000 %
 
 
@@ -315,13 +316,13 @@ def _violations_table(s: Summary) -> tuple[Table, ...]:
         for name, value in s["violations"].items()
         if value >= SHOWN_VIOLATION
     )
-    within = "" if describe_violations(s["violations"]) else f", within the tolerance of {TOLERANCE:.1%}"
+    within = "" if describe_violations(s["violations"]) else f", within the tolerance of {KEPT_TO}"
     return (Table(f"Limits that are exceeded{within}.", ("limit", "by"), over),) if over else ()
 
 
 def _kept(excess: float) -> str:
     """Say that limits are kept, and how far where the largest excess over one [share of its range] is shown."""
-    return "every limit is kept" + (f" to {TOLERANCE:.1%} of its range" if excess >= SHOWN_VIOLATION else "")
+    return "every limit is kept" + (f" to {KEPT_TO} of its range" if excess >= SHOWN_VIOLATION else "")
 
 
 WAYS_OF_DRIVING = {
