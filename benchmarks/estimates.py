@@ -16,25 +16,23 @@ import os
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import numpy as np
 from joblib import Parallel, delayed
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
-from support.damaged_logs import damaged, lively, machine_model
-from support.several import STRAIGHT, draw
+from support.damaged_logs import one_table
+from support.several import DRIVES, draw, drives_of, names_of, simulated
 
 import excite
 from excite.errors import ExciteError
 from excite.logs.log import table_of
-from excite.simulation import measure
 from excite.smoothing import inverse_fit, solver
 
 SHARED = ROOT.parent / "shared"
@@ -91,31 +89,23 @@ def _half_of_emps(half: int) -> Any:
 def simulated_logs() -> dict[str, Source]:
     """Clean logs of rollers, worlds with several effects, and damaged logs of rigs."""
     found: dict[str, Source] = {}
-    for machine, drive in (("va12", "R60"), ("va12", "R60_accuracy"), ("va12_straight", "S40")):
-        design = str(ROOT / "results" / drive / "design")
-        found[f"{machine} {drive}, clean"] = lambda m=machine, d=design: (m, [excite.simulate(m, d, seed=1)])
-    straight = str(ROOT / "results" / "S40" / "design")
-    for seed in range(4):
-        effects = draw(seed, STRAIGHT)
-        found[f"va12_straight, several effects {seed}"] = lambda s=seed, e=effects: (
-            "va12_straight",
-            [excite.simulate("va12_straight", straight, seed=s, effects=e)],
-        )
-    drives = [str(ROOT / "results" / d / "design") for d in ("R60_accuracy", "R60")]
-    for seed in range(2):
-        found[f"va12, several effects {seed}"] = lambda s=seed: (
-            "va12",
-            [excite.simulate("va12", d, seed=s + k, effects=draw(s)) for k, d in enumerate(drives)],
-        )
-    for name in ("rig", "two_joints"):
+    for machine, drives in DRIVES.items():
+        for name, drive in zip(drives, drives_of(machine), strict=True):
+            found[f"{machine} {name}, clean"] = lambda m=machine, d=drive: (m, simulated(m, [d], (), 1))
+    for machine, seeds in (("va12_straight", range(4)), ("va12", range(2))):
+        for seed in seeds:
+            found[f"{machine}, several effects {seed}"] = lambda m=machine, s=seed: (
+                m,
+                simulated(m, drives_of(m), draw(s, names_of(m)), s),
+            )
+    for machine in ("rig", "two_joints"):
         for seed in range(5):
-            found[f"{name}, damaged {seed}"] = lambda name=name, seed=seed: _damaged_log(name, seed)
+            found[f"{machine}, damaged {seed}"] = lambda m=machine, s=seed: _damaged_log(m, s)
     return found
 
 
 def _damaged_log(name: str, seed: int) -> tuple[Any, Any]:
-    model, rng = machine_model(name), np.random.default_rng([seed, 0])
-    table, _ = damaged(measure(model, lively(model, rng), seed=seed), model, rng)
+    model, table, _ = one_table(name, seed, clean=False)
     return model, [table]
 
 
@@ -124,19 +114,19 @@ def identify(name: str, source: Source) -> dict[str, Any]:
     ends, rises, passes = Counter[str](), 0, 0
     minimise, conclude = solver.minimise, inverse_fit.conclude
 
-    def watched(*given: Any) -> Any:
+    def count(status: str, history: Sequence[tuple[float, float]]) -> None:
         nonlocal rises, passes
+        ends[status] += 1
+        passes += len(history)
+        rises += sum(after - before > ROUNDING * abs(before) for before, after in history)
+
+    def watched(*given: Any) -> Any:
         found = minimise(*given)
-        ends[found.status] += 1
-        passes += len(found.history)
-        rises += sum(after - before > ROUNDING * abs(before) for before, after in found.history)
+        count(found.status, found.history)
         return found
 
     def concluded(state: Any, held: Any, status: str, costs: Any, step: float) -> Any:
-        nonlocal rises, passes
-        ends[status] += 1
-        passes += len(costs)
-        rises += sum(after - before > ROUNDING * abs(before) for before, after in costs)
+        count(status, costs)
         return conclude(state, held, status, costs, step)
 
     machine, logs = source()

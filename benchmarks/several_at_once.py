@@ -24,9 +24,7 @@ from joblib import Parallel, delayed
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
-from support.several import STRAIGHT, USUAL, draw, judge, judge_names
-
-DRIVES = {"va12": ("R60_accuracy", "R60"), "va12_straight": ("S40",)}
+from support.several import DRIVES, draw, drives_of, judge, judge_names, names_of
 
 
 def main() -> None:
@@ -38,8 +36,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--diagnose", action="store_true", help="diagnose instead of identifying, on all cores")
     given = parser.parse_args()
-    drives = [str(ROOT / "results" / d / "design") for d in DRIVES[given.machine]]
-    names = tuple(USUAL) if given.machine == "va12" else STRAIGHT
+    drives, names = drives_of(given.machine), names_of(given.machine)
     seeds = range(given.seed, given.seed + given.worlds)
     if given.diagnose:
         for seed in seeds:

@@ -338,6 +338,12 @@ class Model:
         """Return symbols of the further arguments (u, z) of a model with effects, () of a plain one."""
         return () if self.plain else (ca.SX.sym("u", len(self.inputs)), ca.SX.sym("z", len(self.memory)))
 
+    @property
+    def heading(self) -> int | None:
+        """Place of the chassis' heading among the coordinates, None if it is none of them."""
+        root = self.machine.body[0].coordinates
+        return self.coordinates.index(root[2]) if self.machine.planar and root[2] in self.coordinates else None
+
     def for_machine(self, machine: Machine) -> Model:
         """Build the model of a changed machine with the same options. Raises MachineError."""
         return build(machine, self.fit_sensor_effects, self.fit_shapes)

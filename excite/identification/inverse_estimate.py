@@ -17,7 +17,7 @@ from excite.identification.estimate import NOTHING_MOVES_MESSAGE, Discrepancy, E
 from excite.logs import Log, decimate, samples
 from excite.model import Model
 from excite.model.machine import Filter, noise_of
-from excite.smoothing import InverseFit, InverseSettings, fit_inverse, torque_sensors
+from excite.smoothing import InverseFit, InverseSettings, fit_inverse, root_mean_square, torque_sensors
 from excite.text import format_number
 
 SUFFICIENT_STEP = 0.2  # last step of a search that has not converged [standard deviations], up to which intervals hold
@@ -141,10 +141,7 @@ def _discrepancies(model: Model, fit: InverseFit) -> tuple[Discrepancy, ...]:
 def _notes(model: Model, logs: Sequence[Log], fit: InverseFit) -> list[str]:
     """Say what noise was found, and which forces the model lacks."""
     levels = []
-    rms = {
-        s.name: np.sqrt(np.mean(np.concatenate([log.values[s.name] for log in logs]) ** 2))
-        for s in torque_sensors(model)
-    }
+    rms = {s.name: root_mean_square(logs, s) for s in torque_sensors(model)}
     for sensor, level, tails in zip(torque_sensors(model), fit.sizes.noise, fit.sizes.tails, strict=True):
         sheet = (
             f"data sheet {format_number(noise_of(model.machine, sensor), 3)}"

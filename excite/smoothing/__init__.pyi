@@ -46,6 +46,7 @@ from .measurements import (
     predict_readings as predict_readings,
     prepare_logs as prepare_logs,
     prepare_measurements as prepare_measurements,
+    root_mean_square as root_mean_square,
     smoothed_motion as smoothed_motion,
     torque_sensor as torque_sensor,
     transfer_trajectory as transfer_trajectory,

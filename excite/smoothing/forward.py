@@ -318,10 +318,9 @@ INITIAL_ANGLE_STD = 0.1  # [rad, m]
 def initial_std(space: StateSpace, data: Measurements) -> np.ndarray:
     """Return the standard deviation (n,) of the first state about the filtered log, in its unit."""
     usual = np.where(is_speed(space), INITIAL_SPEED_STD, INITIAL_ANGLE_STD)
-    root, coordinates = space.model.machine.body[0], space.model.coordinates
-    if data.turned and root.joint == "planar" and root.coordinates[2] in coordinates:
+    if data.turned and space.model.heading is not None:
         any_angle = np.pi / np.sqrt(3)  # between half a turn either way
-        usual = np.where(space.index == coordinates.index(root.coordinates[2]), any_angle, usual)
+        usual = np.where(space.index == space.model.heading, any_angle, usual)
     return np.where(np.isfinite(space.initial_std), space.initial_std, usual)
 
 

@@ -18,10 +18,10 @@ from excite.model.machine import Filter, Sensor, noise_of
 from excite.smoothing.linearisation import StateSpace
 from excite.text import format_number
 
-# Smallest standard deviation of an encoder edge [counts]: the division error of a good encoder. Without it, slow
-# passages, whose edges are timed exactly, would outweigh everything else.
 LEAST_SENSOR_SHARE = 1e-7  # noise over a signal's range, at least: what integration and rounding leave
 LEAST_TORQUE_SHARE = 1e-3  # noise of a torque over its root mean square, at least; no sensor is better
+# Smallest standard deviation of an encoder edge [counts]: the division error of a good encoder. Without it, slow
+# passages, whose edges are timed exactly, would outweigh everything else.
 EDGE_STD = 0.1
 LEAST_GROUND_SPEED = 5.0  # speed over ground from which a reading is used [standard deviations]; chosen
 BEAT_HZ = 3.0  # a beat below this frequency is as slow as the machine's motion [Hz]; chosen
@@ -289,11 +289,9 @@ def smoothed_motion(
 def _with_heading(space: StateSpace, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Split states as `unpack`, with a heading that follows from its speed, from zero, where it is no state."""
     q, nu, z = space.unpack(state)
-    machine, coordinates = space.model.machine, space.model.coordinates
-    if machine.planar and machine.body[0].coordinates[2] in coordinates:
-        k = coordinates.index(machine.body[0].coordinates[2])
-        if k not in space.index:
-            q[:, k] = integrate_pose(space.model, q, nu, 1 / float(machine.sampling_hz))[:, k]
+    k = space.model.heading
+    if k is not None and k not in space.index:
+        q[:, k] = integrate_pose(space.model, q, nu, 1 / float(space.model.machine.sampling_hz))[:, k]
     return q, nu, z
 
 

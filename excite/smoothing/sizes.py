@@ -74,8 +74,9 @@ def fit_unknown_forces(
     known = dict[str, float]()
     if before is not None:
         known = dict(zip((g.name for g in before.fit.unknown.groups), before.fit.unknown.size, strict=True))
-        white, logs = before.fit.unknown.lacking[0].force_std, _with_torque_noise(logs, before.measurements)
-        inflation = np.square(logs[0].noise.torque / measurements[0].noise.torque)
+        white = before.fit.unknown.lacking[0].force_std
+        inflation = np.square(before.measurements[0].noise.torque / measurements[0].noise.torque)
+        logs = _with_torque_noise(measurements, inflation)
     fit: Fit | None = None
     for k, settings in enumerate(rounds):
         unknown = catalogue(space, list(zip(logs, trajectories, strict=True)), X, white, True if named else None)
@@ -94,8 +95,7 @@ def fit_unknown_forces(
         size = np.maximum(found, SLOWEST_SHRINKING * unknown.size)
         ratio = white_noise_ratios(fit)
         inflation = np.maximum(inflation * ratio[:n_u], 1.0)
-        louder = (replace(data.noise, torque=data.noise.torque * np.sqrt(inflation)) for data in measurements)
-        logs = tuple(replace(data, noise=noise) for data, noise in zip(measurements, louder, strict=True))
+        logs = _with_torque_noise(measurements, inflation)
         white = white.copy()
         white[white > 0] *= np.clip(np.minimum(ratio[n_u:], np.sqrt(ratio[n_u:])), 0.1, 10.0)
     assert fit is not None
@@ -103,10 +103,10 @@ def fit_unknown_forces(
     return FitBeside(replace(fit, covariance=fit.covariance * np.outer(spread, spread)), logs)
 
 
-def _with_torque_noise(logs: Sequence[Measurements], before: Sequence[Measurements]) -> tuple[Measurements, ...]:
-    """Return logs with the noise of torques that a fit before left."""
-    noises = (replace(a.noise, torque=b.noise.torque) for a, b in zip(logs, before, strict=True))
-    return tuple(replace(a, noise=noise) for a, noise in zip(logs, noises, strict=True))
+def _with_torque_noise(logs: Sequence[Measurements], inflation: np.ndarray) -> tuple[Measurements, ...]:
+    """Return logs with the variance of torques inflated (n_u,)."""
+    noises = (replace(data.noise, torque=data.noise.torque * np.sqrt(inflation)) for data in logs)
+    return tuple(replace(data, noise=noise) for data, noise in zip(logs, noises, strict=True))
 
 
 AVERAGED_SCATTER = 1.5  # of the logarithm of a size about the level of all; chosen, wider than where sizes are sought

@@ -385,10 +385,10 @@ def _slope_entries(space: StateSpace, q: np.ndarray, nu: np.ndarray, rate: float
     at = {kind: first + i for i, (_, kind) in enumerate(space.forces) if kind in SLOPES}
     if not at:
         return []
-    root = space.model.machine.body[0].coordinates[2]
-    if len(at) == 1 or root not in space.model.coordinates:
+    turn = space.model.heading
+    if len(at) == 1 or turn is None:
         return [_Entry("slope", "m/s2", 0.02, False, tuple((k, np.ones((len(nu), 1))) for k in at.values()), 1)]
-    heading = integrate_pose(space.model, q, nu, 1 / rate)[:, space.model.coordinates.index(root)]
+    heading = integrate_pose(space.model, q, nu, 1 / rate)[:, turn]
     c, s = np.cos(heading), np.sin(heading)
     shapes = ((at[SLOPES[0]], np.column_stack([c, s])), (at[SLOPES[1]], np.column_stack([-s, c])))
     return [_Entry("slope", "m/s2", 0.02, False, shapes, 2)]

@@ -24,8 +24,7 @@ def place_on_lane(model: Model, problem: Problem, motion: Motion) -> np.ndarray:
     fit = _fit_polygon if problem.lane_polygon_m else _fit_box
     best, chosen = np.inf, (0.0, np.zeros(2))
     whole = 2 * np.pi if problem.lane_polygon_m else np.pi  # a box is symmetric under half a turn
-    turns = model.machine.body[0].coordinates[2] in model.coordinates
-    for turn in np.linspace(0, whole, HEADINGS)[:-1] if turns else (0.0,):
+    for turn in np.linspace(0, whole, HEADINGS)[:-1] if model.heading is not None else (0.0,):
         excess, shift = fit(problem, _turned(path, turn))
         if excess < best - 1e-9:
             best, chosen = excess, (float(turn), shift)

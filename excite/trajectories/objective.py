@@ -309,10 +309,9 @@ def row_noise(model: Model) -> np.ndarray:
     noise = np.full(len(model.coordinates), force)
     for k, body in zip(model.actuated, machine.actuated, strict=True):
         noise[k] = torque.get(body.index, usual)
-    if machine.planar and machine.body[0].coordinates[2] in model.coordinates:
+    if (turn := model.heading) is not None:
         q, nu, _ = model.symbols()
         M = ca.Function("M", [q], [model.equations(q, nu, ca.DM(model.nominal))[0]])(0).full()
-        turn = model.coordinates.index(machine.body[0].coordinates[2])
         noise[turn] = force * float(np.sqrt(M[turn, turn] / M[0, 0]))
     return noise
 

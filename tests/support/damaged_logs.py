@@ -158,13 +158,16 @@ def damaged(table: pd.DataFrame, model: Model, rng: np.random.Generator) -> tupl
     return table, ", ".join(said)
 
 
-def one_log(name: str, method: str | None, seed: int, clean: bool) -> dict[str, Any]:
-    """Simulate, damage and identify one log; return what came of it."""
+def one_table(name: str, seed: int, clean: bool) -> tuple[Model, pd.DataFrame, str]:
+    """Simulate one log, damage it if it is not to be clean, and say how."""
     model, rng = machine_model(name), np.random.default_rng([seed, int(clean)])
     table = measure(model, lively(model, rng), seed=seed)
-    what = "clean"
-    if not clean:
-        table, what = damaged(table, model, rng)
+    return model, *((table, "clean") if clean else damaged(table, model, rng))
+
+
+def one_log(name: str, method: str | None, seed: int, clean: bool) -> dict[str, Any]:
+    """Simulate, damage and identify one log; return what came of it."""
+    model, table, what = one_table(name, seed, clean)
     method = method or recommend_method(model)
     row: dict[str, Any] = {"machine": name, "method": method, "seed": seed, "what": what}
     begin = time.process_time()

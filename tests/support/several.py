@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from support.files import RESULTS
 
 import excite
 
@@ -30,6 +31,17 @@ USUAL = {
     "torque_ripple": (25.0, ("front_roll", "rear_roll")),
 }
 STRAIGHT = tuple(name for name in USUAL if name not in ("measuring_wheel_radius",))
+DRIVES = {"va12": ("R60_accuracy", "R60"), "va12_straight": ("S40",)}  # designs in results/ of each machine
+
+
+def names_of(machine: str) -> tuple[str, ...]:
+    """Return the effects that a machine can have."""
+    return tuple(USUAL) if machine == "va12" else STRAIGHT
+
+
+def drives_of(machine: str) -> list[str]:
+    """Return the designs of a machine."""
+    return [str(RESULTS / d / "design") for d in DRIVES[machine]]
 
 
 @dataclass(frozen=True)
