@@ -190,11 +190,6 @@ class Model:
         return self.fully_driven and bool(self.active_coordinates)
 
     @cached_property
-    def rows(self) -> tuple[str, ...]:
-        """Names of the equations, one per coordinate."""
-        return self.coordinates
-
-    @cached_property
     def actuated(self) -> tuple[int, ...]:
         """Indices of the actuated coordinates, one per input."""
         return tuple(self.coordinates.index(self.machine.coordinate(b)) for b in self.machine.actuated)

@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "lines": 58_585,
+    "lines": 58_580,
     "named constants": 811,
     "files over 600 lines": 0,
     "functions over 80 lines": 4,

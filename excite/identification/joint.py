@@ -193,7 +193,7 @@ def _build_estimate(
             a = derivative(nu.T, float(model.machine.sampling_hz)).T
         rows = model.stacked_regressor(q.T, nu.T, a.T, *effect_inputs)
         W.append(rows.reshape(-1, len(fit.X)))
-        measured, error = np.zeros((2, len(model.rows), len(u)))
+        measured, error = np.zeros((2, len(model.coordinates), len(u)))
         measured[list(model.actuated)], error[list(model.actuated)] = data.torque.T, -trajectory.sampled_torque_error.T
         if beside_forces and model.plain:
             error = measured - model.predict(q.T, nu.T, a.T, model.expand @ fit.X).full()
