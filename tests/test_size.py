@@ -11,8 +11,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "lines": 58_580,
-    "named constants": 811,
+    "lines": 58_984,
+    "named constants": 816,
     "files over 600 lines": 0,
     "functions over 80 lines": 4,
     "functions with more than 8 parameters": 15,

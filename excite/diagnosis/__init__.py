@@ -10,8 +10,8 @@
 - `residuals_of_logs` gives the torques, forces and innovations that the model does not explain (`LogResiduals`), and
   `dependence_strength`, `bin_means` and `amplitude_spectrum` show on what they depend.
 - `TorqueDiagnosis` is what torques tell: rows and columns of effects (`torque_rows`), fits and their whitening
-  (`torque_fit`), the choice of effects (`torque_search`), smooth curves of what is left (`curves`). Both kinds of
-  diagnosis choose by `evidence`.
+  (`torque_fit`), the choice of effects (`torque_search`), smooth curves of what is left (`torque_curves`). Both kinds
+  of diagnosis choose by `evidence`; the curves of a machine on soil are in `soil_curves`.
 - `run_forked` runs independent fits side by side.
 """
 

@@ -14,6 +14,7 @@ import numpy as np
 import scipy.stats
 
 from excite.diagnosis import magnitude_interval, selection
+from excite.diagnosis.curves import Curve
 from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.fits import ExtendedFit, fit_machine, fit_machine_that_sticks
 from excite.diagnosis.parallel import CallRunner, run_in_turn
@@ -106,7 +107,8 @@ class Diagnosis:
     verdict: clean, named, tied or unexplained. before, after: fits without and with the findings. share: share of the
     excess misfit that they explain. located: lines that describe what is unexplained. without: for each finding the fit
     without it but with all others, None if no exact dynamics follow the logs then. nearest: the effect that explains
-    most, if nothing is named.
+    most, if nothing is named. curves: smooth functions of one signal, in `after` as well, that predict what no effect
+    explains.
     """
 
     verdict: str
@@ -117,6 +119,7 @@ class Diagnosis:
     located: tuple[str, ...]
     without: tuple[ExtendedFit | None, ...] = ()
     nearest: NearestEffect | None = None
+    curves: tuple[Curve, ...] = ()
 
     @property
     def sources(self) -> tuple[str, ...]:

@@ -13,11 +13,11 @@ import numpy as np
 import tomli_w
 
 from excite import identification, interrupt
-from excite.diagnosis import hold_out, residuals, selection, separating_run, torque_regression
+from excite.diagnosis import hold_out, residuals, selection, separating_run, soil_curves, torque_regression
 from excite.diagnosis.acceptance import reason_against
 from excite.diagnosis.clean_simulation import Remainder, measure_remainder
 from excite.diagnosis.deadline import Deadline
-from excite.diagnosis.diagnosis import Diagnosis, Finding, conclude, diagnose
+from excite.diagnosis.diagnosis import Diagnosis, Finding, anomaly_lines, conclude, diagnose
 from excite.diagnosis.fits import ExtendedFit
 from excite.diagnosis.hold_out import HoldOutErrors, HoldOutGain
 from excite.diagnosis.parallel import CallRunner, run_in_turn
@@ -89,12 +89,19 @@ def assess(
     told = dict(zip(map(id, stages), torques if by_torques else errors, strict=True))
     gains = tuple(hold_out.hold_out_gain(told.get(id(x)), told[id(last)]) for x in d.without)
     total_gain = hold_out.hold_out_gain(told[id(d.before)], told[id(last)])
+    if d.verdict == "unexplained" and not by_torques and not deadline.is_over():
+        report(0.95, "drawing what is left")
+        if (curves := soil_curves.find_soil_curves(last, told[id(last)], runner)) is not None:
+            d = replace(d, after=curves.stage, curves=curves.curves, located=anomaly_lines(curves.stage))
+            total_gain = hold_out.hold_out_gain(told[id(d.before)], curves.errors)
     before = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.before.alone))
-    after = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.after.alone)) if d.findings else before
+    extended = d.findings or d.curves
+    after = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.after.alone)) if extended else before
     located = d.located
     if d.verdict == "unexplained":  # replace lines of suspect sensors by located misfits
         other_lines = [line for line in d.located if line not in d.after.suspect_sensors]
         located = (
+            *map(str, d.curves),
             *other_lines[:FIRST_ANOMALY_LINES],
             *residuals.locate_misfit(d.after.alone),
             *other_lines[FIRST_ANOMALY_LINES:],
@@ -260,6 +267,7 @@ def assess_torques(d: TorqueDiagnosis, errors: Sequence[HoldOutErrors]) -> Asses
 def summarise(a: Assessment) -> dict[str, Any]:
     """Return the summary of `excite diagnose`, ready for JSON."""
     d = a.diagnosis
+    extended = d.findings or d.curves
     return {
         "verdict": d.verdict,
         "answer": answer_text(a),
@@ -267,8 +275,8 @@ def summarise(a: Assessment) -> dict[str, Any]:
         "differences": None if a.differences is None else identification.summarise_agreement(a.differences),
         "error_before_percent": a.total_gain.before if a.total_gain else None,
         "error_after_percent": a.total_gain.after if a.total_gain else None,
-        "gain_percent": a.total_gain.percent if a.total_gain and d.findings else None,
-        "gain_ci95": _interval_list(a.total_gain) if d.findings else None,
+        "gain_percent": a.total_gain.percent if a.total_gain and extended else None,
+        "gain_ci95": _interval_list(a.total_gain) if extended else None,
         "signals": signal_table(a),
         "separating_run": a.separating_run,
         "share_explained": d.share,
@@ -403,6 +411,12 @@ def answer_text(a: Assessment) -> str:
                 text += f", but then {values}, which no machine has (check the machine's dimensions)"
             if d.nearest.reason:
                 text += f", but {d.nearest.reason}"
+        if isinstance(d, Diagnosis) and d.curves:
+            c = d.curves[0]
+            forms = "a curve without a name takes" if c.together == 1 else f"{c.together} curves without a name take"
+            text += (
+                f"; {forms} part of it: the error on withheld stretches is {_describe_change(c.percent, c.interval)}"
+            )
         return text + "."
     remark = ""
     if a.total_gain:
@@ -459,7 +473,7 @@ def machine_file(name: str, machine: Machine, d: Diagnosis | TorqueDiagnosis) ->
     For a shipped machine the file holds only what is new; for a machine file it holds everything. Base parameters
     combine several parameters of the file and are left out.
     """
-    curves = [c.entry for c in d.curves] if isinstance(d, TorqueDiagnosis) else []
+    curves = [c.entry for c in d.curves]
     if not (d.findings or curves):
         return None
     found = map(_effect_table, d.findings)

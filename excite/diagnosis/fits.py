@@ -345,6 +345,19 @@ def _follow(
     return without_smoother_levels(beside.fit), beside.measurements
 
 
+def beside_unknown_forces(stage: ExtendedFit) -> ExtendedFit:
+    """Return a fit beside unknown forces, also where exact dynamics follow the logs. Raises NotConvergedError."""
+    if not stage.exact:
+        return stage
+    data, first = stage.data, (stage.fit.X, stage.fit.trajectories)
+    found = smoothing.fit_unknown_forces(
+        data.space, data.measurements, data.starts, data.held, ROUNDS_BESIDE, True, first
+    )
+    if not found.fit.linear:
+        found.fit.required()
+    return replace(stage, fit=without_smoother_levels(found.fit), measurements=found.measurements)
+
+
 def _continued(machine: Machine, previous: ExtendedFit) -> tuple[FitData, list[Trajectory], np.ndarray]:
     """Return data of a machine with other effects, and where a fit of it begins from a previous fit."""
     data = adapt_data(machine, previous)

@@ -16,11 +16,12 @@ import numpy as np
 import scipy.stats
 
 from excite import identification
-from excite.diagnosis.curves import Curve, find_curves
+from excite.diagnosis.curves import Curve
 from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.diagnosis import FORMULA_STD_SHARE, MIN_EXPLAINED_SHARE, Finding, NearestEffect, ParameterChange
 from excite.diagnosis.hold_out import HoldOutErrors, torque_names
 from excite.diagnosis.selection import ProgressCallback
+from excite.diagnosis.torque_curves import find_curves
 from excite.diagnosis.torque_fit import Term, TorqueFit
 from excite.diagnosis.torque_rows import TorqueRows, torque_rows
 from excite.diagnosis.torque_search import Search, scaled_magnitude

@@ -32,7 +32,7 @@ from excite.reports.figures import (
     set_title,
     wrap_label,
 )
-from excite.reports.torque_figures import torque_figures_by_file
+from excite.reports.torque_figures import curves_by_file, torque_figures_by_file
 from excite.text import format_number
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
@@ -58,12 +58,13 @@ MAX_INNOVATION = 30.0  # mean square of innovations at which the colours end; ch
 def figure_calls(place: Path, d: Diagnosis | TorqueDiagnosis, title: str) -> list[Callable[[], dict[str, Explorable]]]:
     """Return independent calls that draw the figures of a diagnosis into its folder, and return what charts show.
 
-    clearest.png, misfit.png and when.png of each log; misfit.png and, where there are curves, curves.png of one by
-    regression.
+    clearest.png, misfit.png and when.png of each log, misfit.png alone of one by regression; curves.png where there
+    are curves.
     """
     if isinstance(d, TorqueDiagnosis):
         return [partial(_save, draw, place / file) for file, draw in figures_by_file(d, title).items()]
-    return [partial(_draw, place, d, title, kinds) for kinds in TOGETHER]
+    curves = [partial(_save, draw, place / file) for file, draw in curves_by_file(d, title).items()]
+    return [*(partial(_draw, place, d, title, kinds) for kinds in TOGETHER), *curves]
 
 
 def figures_by_file(d: Diagnosis | TorqueDiagnosis, title: str) -> dict[str, Callable[[], Figure]]:
@@ -71,7 +72,8 @@ def figures_by_file(d: Diagnosis | TorqueDiagnosis, title: str) -> dict[str, Cal
     if isinstance(d, TorqueDiagnosis):
         return torque_figures_by_file(d, title)
     n = len(d.before.data.logs)
-    return {_file(kind, k, n): partial(_one, d, title, kind, k) for kind in KINDS for k in range(n)}
+    own = {_file(kind, k, n): partial(_one, d, title, kind, k) for kind in KINDS for k in range(n)}
+    return own | curves_by_file(d, title)
 
 
 def _save(draw: Callable[[], Figure], file: Path) -> dict[str, Explorable]:
@@ -95,7 +97,7 @@ def _figures(d: Diagnosis, title: str, kinds: Sequence[str]) -> Iterator[tuple[s
     """Yield some of the figures for every log, each with its file."""
     before, after = d.before, d.after
     without = diagnosis.residuals_of_logs(before)
-    beside = diagnosis.residuals_of_logs(after) if d.findings else [None] * len(without)
+    beside = diagnosis.residuals_of_logs(after) if d.findings or d.curves else [None] * len(without)
     draws: dict[str, Callable[..., Figure]] = {
         **KINDS,
         "when": partial(when_figure, words=signal_descriptions(before.machine)),

@@ -37,7 +37,7 @@ CAPTIONS = {
     " diamonds and bars the estimate and its 95 % interval, all in standard deviations known before.",
     "budget.png": "What makes the variance of each parameter: noise with what the model lacks, and the tolerances of"
     " the machine file. What takes a large share is worth measuring.",
-    "curves.png": "The torque that the model lacks in each joint as a function of one signal: mean, and its 95 % band."
+    "curves.png": "What the model lacks in each joint or contact as a function of one signal: mean, and its 95 % band."
     " Flat at zero is right.",
     "log.png": "Every channel that the machine file knows, in SI units, over time: as recorded, and as it is used after"
     " repair and resampling.",

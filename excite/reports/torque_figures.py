@@ -1,8 +1,8 @@
-"""Figures of a diagnosis of torques: errors of the torques, and the curves that they follow."""
+"""Figures of a diagnosis of torques: their errors; and, of any diagnosis, curves of what its model lacks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from excite.diagnosis import Curve, TorqueDiagnosis
+from excite.diagnosis import Curve, Diagnosis, TorqueDiagnosis
 from excite.reports.figure_files import layout_width
 from excite.reports.figures import COLOURS, is_narrow, legend_below, letters_along, new_figure, set_title, wrap_label
 
@@ -22,8 +22,12 @@ MAX_COLUMNS, MIN_CURVE_IN = 3, 3.0  # curves side by side, and the width of one 
 
 def torque_figures_by_file(d: TorqueDiagnosis, title: str) -> dict[str, Callable[[], Figure]]:
     """Return what draws misfit.png and, where there are curves, curves.png."""
-    drawn: dict[str, Callable[[], Figure]] = {"misfit.png": partial(misfit_of_torques, d, title)}
-    return drawn | {"curves.png": partial(curves_figure, d, title)} if d.curves else drawn
+    return {"misfit.png": partial(misfit_of_torques, d, title), **curves_by_file(d, title)}
+
+
+def curves_by_file(d: Diagnosis | TorqueDiagnosis, title: str) -> dict[str, Callable[[], Figure]]:
+    """Return what draws curves.png, if there are curves."""
+    return {"curves.png": partial(curves_figure, d.curves, title)} if d.curves else {}
 
 
 def misfit_of_torques(d: TorqueDiagnosis, title: str) -> Figure:
@@ -82,19 +86,19 @@ def _means(x: np.ndarray, y: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, 
     return np.array([x[p].mean() for p in parts]), np.array([y[p].mean() for p in parts])
 
 
-def curves_figure(d: TorqueDiagnosis, title: str) -> Figure:
-    """Plot the torque that each joint lacks as a function of one signal, with its 95 % band."""
-    columns = min(MAX_COLUMNS, len(d.curves))
+def curves_figure(curves: Sequence[Curve], title: str) -> Figure:
+    """Plot what each joint or contact lacks as a function of one signal, with its 95 % band."""
+    columns = min(MAX_COLUMNS, len(curves))
     own = max(3.6 * columns + 0.4, 6.4)
     columns = min(columns, max(1, int(layout_width(own) / MIN_CURVE_IN)))
-    lines = -(-len(d.curves) // columns)
+    lines = -(-len(curves) // columns)
     figure = new_figure(own, 2.6 * lines + 0.9)
     axes = figure.subplots(lines, columns, squeeze=False).ravel()
-    for axis, curve in zip(axes, d.curves, strict=False):
+    for axis, curve in zip(axes, curves, strict=False):
         _draw_curve(axis, curve)
-    for axis in axes[len(d.curves) :]:
+    for axis in axes[len(curves) :]:
         axis.set_axis_off()
-    set_title(figure, f"{title}: torque that the model lacks, mean and 95 % band")
+    set_title(figure, f"{title}: what the model lacks, mean and 95 % band")
     return figure
 
 
@@ -105,6 +109,9 @@ def _draw_curve(axis: Axes, curve: Curve) -> None:
     )
     axis.plot(curve.at, curve.value, color=AFTER)
     axis.axhline(0.0, color="0.5", linewidth=0.8)
-    axis.set_xlabel(wrap_label(f"{signal.removeprefix('the ').replace('_', ' ')} [{of}]", 34), fontsize=9)
-    axis.set_ylabel(wrap_label(f"missing in {row} [{unit}]", 28), fontsize=9)
+    axis.set_xlabel(
+        wrap_label(f"{signal.removeprefix('the ').removeprefix('its ').replace('_', ' ')} [{of}]", 34), fontsize=9
+    )
+    missing = "missing" if curve.lacks == "a torque" else curve.lacks.removeprefix("a ").replace("its ", "")
+    axis.set_ylabel(wrap_label(f"{missing} in {row} [{unit}]", 28), fontsize=9)
     axis.tick_params(labelsize=8)

@@ -20,6 +20,7 @@ from .linearisation import (
     BatchedFunction as BatchedFunction,
     StateSpace as StateSpace,
     build_state_space as build_state_space,
+    feature_names as feature_names,
 )
 from .log_fit import (
     ACCEPTABLE_STEP as ACCEPTABLE_STEP,

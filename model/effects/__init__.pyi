@@ -25,4 +25,9 @@ from .placing import (
     without_effect as without_effect,
 )
 from .sizes import GRAVITY as GRAVITY, duration as duration, large_torque as large_torque
-from .torque_map import MAP_NODES as MAP_NODES, table_shapes as table_shapes
+from .tables import (
+    MAP_NODES as MAP_NODES,
+    SOIL_SIGNALS as SOIL_SIGNALS,
+    soil_table as soil_table,
+    torque_table as torque_table,
+)

@@ -27,6 +27,7 @@ CATALOGUE = _by_name(
     *joint_effects.DRIVES,
     *joint_effects.PERIODIC,
     *ground_effects.SOIL,
+    *ground_effects.TABLES,
     *ground_effects.FORCES,
     *joint_effects.ARTICULATION,
     *file_effects.MACHINE_FILE,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -59,7 +59,7 @@ class Soil:
     """Arguments of a contact's force law: slips, yaw rate [rad/s], Kx, Ky [N], saturations (None: linear).
 
     ahead [m]: the force acts so far ahead of the contact's place in the machine file. turned [rad]: its axes are turned
-    by so much against its chassis.
+    by so much against its chassis. added [N]: forces along and across beside the law.
     """
 
     slip: mechanics.Slip
@@ -70,10 +70,12 @@ class Soil:
     lateral: mechanics.Saturation | None = None
     ahead: ca.SX | float = 0.0
     turned: ca.SX | float = 0.0
+    added: tuple[ca.SX | float, ca.SX | float] = (0.0, 0.0)
 
     def wrench(self, on: Contact) -> mechanics.Wrench:
         """Return forces and moment on a contact."""
-        return mechanics.wrench(on, self.slip, self.yaw, self.Kx, self.Ky, self.saturation, self.lateral)
+        law = mechanics.wrench(on, self.slip, self.yaw, self.Kx, self.Ky, self.saturation, self.lateral)
+        return replace(law, Sx=law.Sx + self.added[0], Sy=law.Sy + self.added[1])
 
 
 @dataclass(frozen=True)

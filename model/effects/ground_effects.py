@@ -6,7 +6,7 @@ from math import pi
 
 import casadi as ca
 
-from excite.model.effects import ground_map, sizes, soil
+from excite.model.effects import ground_map, sizes, soil, tables
 from excite.model.effects.effect import PHASE, Channel, Effect, SampleView, Shape, Site, Values, between, form_choice
 
 MAX_SLIDE_INSTANTS = 120  # trial instants of a payload shift in a long log; chosen
@@ -152,6 +152,37 @@ SOIL = (
         channel=lambda t, p: Channel(offset=p["shake"] * _window(t, p) * ca.sin(2 * pi * p["frequency"] * t)),
         shaking=_window,
         timed=True,
+    ),
+)
+
+TABLE = "piecewise linear basis: Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., 5.2"
+NO_CAUSE = "; a diagnosis fits it to what no other effect explains, and never names it as a cause"
+TABLES = (
+    Effect(
+        "lengthwise_map",
+        ("contacts",),
+        "-",
+        "a force along the contact, or a share by which Kx is larger, by a table of slip, speed or the distance rolled,"
+        f" times A{NO_CAUSE}",
+        "a lengthwise force that the soil's law lacks, a function of one signal",
+        TABLE,
+        sizes.constant(1.0),
+        tables.soil_map_shapes(),
+        grid=(),
+        soil=tables.lengthwise_by_table,
+    ),
+    Effect(
+        "lateral_map",
+        ("contacts",),
+        "-",
+        "a force across the contact, or a share by which Ky is larger, by a table of slip, speed or the distance"
+        f" rolled, times A{NO_CAUSE}",
+        "a lateral force that the soil's law lacks, a function of one signal",
+        TABLE,
+        sizes.constant(1.0),
+        tables.soil_map_shapes(),
+        grid=(),
+        soil=tables.lateral_by_table,
     ),
 )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from excite.model.effects import friction, sizes, torque_map
+from excite.model.effects import friction, sizes, tables
 from excite.model.effects.effect import (
     PHASE,
     Channel,
@@ -257,9 +257,9 @@ FRICTION = (
         "a torque error that is a function of one signal",
         "piecewise linear basis: Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., 5.2",
         sizes.constant(1.0),
-        torque_map.map_shapes(),
+        tables.torque_map_shapes(),
         grid=(),
-        torque=torque_map.resist_by_table,
+        torque=tables.resist_by_table,
     ),
 )
 

@@ -22,12 +22,14 @@ from excite.model import Model, build, signatures, standard_parameters
 from excite.model.effects import (
     CATALOGUE,
     DEFAULT_DURATION,
+    MAP_NODES,
     Effect,
     PlacedEffect,
     Site,
     ground_map,
     placing,
-    table_shapes,
+    soil_table,
+    torque_table,
 )
 from excite.model.machine import EffectEntry, Quantity, machine
 from excite.model.mechanics import tree
@@ -198,7 +200,7 @@ def test_effects_have_places_at_every_joint_where_they_make_sense(emps: Model) -
 def test_a_torque_map_is_a_table_between_its_nodes(va12: Model) -> None:
     """Against numpy's interpolation: a torque of the articulation by the front roll's speed, constant beyond."""
     x, f = np.array([-2, -1.5, -1, -0.5, -0.1, 0, 0.3, 0.5, 1, 1.2, 2]), np.arange(11) ** 2 - 30.0
-    shapes = table_shapes("speed", 1, x.tolist(), f.tolist())
+    shapes = torque_table("speed", 1, x.tolist(), f.tolist())
     model = build(placing.with_effects(VA12, shaped("torque_map@articulation=2", shapes)))
     w = np.linspace(-3, 3, 50)
     q, a, nu, u, z = (np.zeros((n, len(w))) for n in (6, 6, 6, 3, 0))
@@ -211,6 +213,30 @@ def test_a_torque_map_is_a_table_between_its_nodes(va12: Model) -> None:
     for wrong, said in (({"x3": 5.0}, "x1 to x11 must increase"), ({"of": 9.0}, "of must be the number of a joint")):
         with pytest.raises(MachineError, match=said):
             build(placing.with_effects(VA12, shaped("torque_map@articulation=2", shapes | wrong)))
+
+
+@pytest.mark.parametrize("changes", ["force", "stiffness"])
+@pytest.mark.parametrize("axis", ["lengthwise", "lateral"])
+def test_a_map_of_the_soil_adds_a_force_or_a_share_of_a_stiffness(va12: Model, axis: str, changes: str) -> None:
+    """From the linear law and numpy's interpolation: forces on the machine going straight on with the front roll."""
+    x, f = np.linspace(-0.1, 0.1, MAP_NODES), np.arange(MAP_NODES) / 20 - 0.2
+    slip = "lengthwise slip" if axis == "lengthwise" else "lateral slip"
+    table = soil_table(slip, x.tolist(), f.tolist(), changes)
+    model = build(placing.with_effects(VA12, shaped(f"{axis}_map@front_roll=2", table)))
+    n, R, eps = 30, 0.65, 0.05
+    q, a, nu, u, z = (np.zeros((k, n)) for k in (6, 6, 6, 3, 0))
+    rim, off = 0.8, np.linspace(-0.12, 0.12, n)
+    nu[0], nu[1], nu[3], nu[5] = rim, 0.0, rim / R, rim / R
+    nu[0 if axis == "lengthwise" else 1] += off
+    g = off / np.hypot(rim, eps)
+    K = dict(zip(va12.base.standard, va12.expand @ va12.nominal, strict=True))
+    law = K["Kx1" if axis == "lengthwise" else "Ky1"] * g
+    force = 2 * np.interp(g, x, f) * (1.0 if changes == "force" else law)
+    more = model.balance(q, nu, a, model.expand @ model.nominal, u, z).full()
+    more -= va12.balance(q, nu, a, va12.expand @ va12.nominal).full()
+    row = 0 if axis == "lengthwise" else 1
+    np.testing.assert_allclose(more[row], -force, atol=1e-6)
+    np.testing.assert_allclose(more[3], R * force if axis == "lengthwise" else 0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("slow", [0.0, 0.6])

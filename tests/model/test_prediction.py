@@ -324,11 +324,11 @@ def test_forward_dynamics_inverts_the_prediction(name: str, seed: int) -> None:
 
 
 def test_inputs_drive_their_own_rows(va12: Model) -> None:
-    assert va12.rows == va12.coordinates == ("x0", "y0", "theta0", "theta1", "theta2", "theta4")
+    assert va12.coordinates == ("x0", "y0", "theta0", "theta1", "theta2", "theta4")
     assert va12.inputs == ("u1", "u2", "u4")
     assert va12.actuated == (3, 4, 5)
     straight = MODELS["va12_straight"]
-    assert straight.rows == ("x0", "theta1", "theta4")
+    assert straight.coordinates == ("x0", "theta1", "theta4")
     assert straight.inputs == ("u1", "u4")
     assert straight.slips == ("gx1", "gx4")
 

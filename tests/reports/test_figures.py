@@ -195,7 +195,8 @@ def torques(model: Model) -> Any:
     made = SimpleNamespace(model=model, rows=[rows], residual=[rng.normal(size=shape)], level=level, lowest=level)
     names = tuple((s.name, "N m") for s in machine.sensors("full") if s.kind == "torque")
     curve = {"at": t, "value": 12345.6 * np.sin(t), "std": 0 * t + 100, "signal": (f"the speed of {LONG}", "rad/s")}
-    curves = [SimpleNamespace(row=row, **curve) for row in names]
+    lacks = ("a torque", "a change of its lengthwise stiffness")
+    curves = [SimpleNamespace(row=row, lacks=lacks[k % 2], **curve) for k, row in enumerate(names)]
     return SimpleNamespace(
         before=made, after=made, torques=names, findings=("one",), sources=("log.csv",), curves=curves
     )
@@ -288,7 +289,7 @@ KINDS: dict[str, Callable[[Model], Figure]] = {
     "swept study": lambda m: study(m, (10.0, 20.0, 40.0, 80.0)),
     "study": lambda m: study(m, (60.0,)),
     "study of verdicts": lambda m: study(m, (60.0,), verdicts=True),
-    "curves": lambda m: torque_figures.curves_figure(torques(m), m.machine.title),
+    "curves": lambda m: torque_figures.curves_figure(torques(m).curves, m.machine.title),
 }
 
 

@@ -1,0 +1,130 @@
+"""Torques of joints and forces of the soil as tables of one signal: what no other effect explains."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from excite.errors import MachineError
+from excite.model.effects import sizes
+from excite.model.effects.effect import SampleView, Shape, Site, Soil, Values, unit_size
+
+MAP_NODES = 11  # rows of the table; chosen
+SIGNALS = ("angle", "speed", "torque")  # in the order of the shape `signal`
+CHANGES = ("force", "stiffness")  # by the shape `changes`
+# By `signal`, with units.
+SOIL_SIGNALS = {"lengthwise slip": "-", "lateral slip": "-", "slip": "-", "speed": "m/s", "rolled distance": "m"}
+SLIP_ROUNDING = 1e-4  # below which the resultant slip is round
+_NODES = tuple(np.linspace(-1, 1, MAP_NODES))
+
+
+def torque_map_shapes() -> dict[str, Shape]:
+    """Declare signal, nodes and torques of a joint's table; a bump of 5 % of its dry friction by default."""
+    return {
+        "signal": _choice(SIGNALS),
+        "of": _constant("-", -1.0, meaning="number of the body whose signal it is; -1: of the joint itself"),
+        **_rows("N m", sizes.coulomb(0.05), "rad, rad/s, N m; sliding: m, m/s, N", "torque"),
+    }
+
+
+def soil_map_shapes() -> dict[str, Shape]:
+    """Declare what a contact's table changes, its signal, nodes and values; a bump of 5 % by default."""
+    return {
+        "changes": _choice(CHANGES),
+        "signal": _choice(tuple(SOIL_SIGNALS), 0.0),
+        **_rows("-", sizes.constant(0.05), ", ".join(SOIL_SIGNALS.values()), "force [N] or share of the stiffness"),
+    }
+
+
+def _choice(names: Sequence[str], default: float = 1.0) -> Shape:
+    listed = ", ".join(f"{k}: {name}" for k, name in enumerate(names))
+    return _constant("-", default, meaning=listed, only=tuple(float(k) for k in range(len(names))))
+
+
+def _rows(unit: str, size: Callable[[Site], float], units: str, value: str) -> dict[str, Shape]:
+    """Declare nodes x1, ... in `units` and values f1, ... of a table; a bump of a size by default."""
+    nodes = {f"x{k + 1}": _constant("-", x) for k, x in enumerate(_NODES)}
+    nodes["x1"] = _constant("-", _NODES[0], meaning=f"x1 to x{MAP_NODES}: the signal [{units}]")
+    values = {f"f{k + 1}": _constant(unit, (1 - x**2) ** 2, size=size) for k, x in enumerate(_NODES)}
+    meaning = f"f1 to f{MAP_NODES}: the {value} there, linear between, constant beyond"
+    values["f1"] = _constant(unit, 0.0, meaning=meaning, size=size)
+    return {**nodes, **values}
+
+
+def _constant(
+    unit: str,
+    default: float,
+    meaning: str = "",
+    only: tuple[float, ...] = (),
+    size: Callable[[Site], float] = unit_size,
+) -> Shape:
+    return Shape(unit, default, (default,), size, whole=True, meaning=meaning, only=only, either_sign=True)
+
+
+def torque_table(signal: str, of: int, x: Sequence[float], f: Sequence[float]) -> dict[str, float]:
+    """Return the shapes of a table: torques f (MAP_NODES,) at x (MAP_NODES,) of a body's signal."""
+    return {"signal": float(SIGNALS.index(signal)), "of": float(of)} | _numbered(x, f)
+
+
+def soil_table(signal: str, x: Sequence[float], f: Sequence[float], changes: str) -> dict[str, float]:
+    """Return the shapes of a table: f (MAP_NODES,) at x (MAP_NODES,) of a contact's signal. changes: see CHANGES."""
+    head = {"changes": float(CHANGES.index(changes)), "signal": float(list(SOIL_SIGNALS).index(signal))}
+    return head | _numbered(x, f)
+
+
+def _numbered(x: Sequence[float], f: Sequence[float]) -> dict[str, float]:
+    return {f"{key}{k + 1}": float(v) for key, row in (("x", x), ("f", f)) for k, v in enumerate(row)}
+
+
+def resist_by_table(s: SampleView, k: int, p: Values) -> ca.SX:
+    """Return the torque of a table on joint k. Raises MachineError for nodes out of order or an unknown body."""
+    signals: Sequence[Mapping[int, ca.SX]] = (s.q, s.w, s.u)
+    own, of = signals[int(p["signal"])], int(p["of"])
+    if (k if of < 0 else of) not in own:
+        allowed = ", ".join(str(n) for n in own)
+        raise MachineError(f"effect torque_map: of must be the number of a joint, one of {allowed}, or -1 (got {of})")
+    return -p["A"] * _interpolated("torque_map", own[k if of < 0 else of], p)
+
+
+def lengthwise_by_table(s: SampleView, k: int, p: Values, soil: Soil) -> Soil:
+    """Add a table to the force along a contact, or change Kx by its share. Raises MachineError."""
+    value = _soil_value("lengthwise_map", s, k, p)
+    along, across = soil.added
+    if _adds_force(p):
+        return replace(soil, added=(along + value, across))
+    return replace(soil, Kx=soil.Kx * (1 + value))
+
+
+def lateral_by_table(s: SampleView, k: int, p: Values, soil: Soil) -> Soil:
+    """Add a table to the force across a contact, or change Ky by its share. Raises MachineError."""
+    value = _soil_value("lateral_map", s, k, p)
+    along, across = soil.added
+    if _adds_force(p):
+        return replace(soil, added=(along, across + value))
+    return replace(soil, Ky=soil.Ky * (1 + value))
+
+
+def _adds_force(p: Values) -> bool:
+    return CHANGES[int(p["changes"])] == "force"
+
+
+def _soil_value(effect: str, s: SampleView, k: int, p: Values) -> ca.SX:
+    """Return A times the table at a contact's signal."""
+    r = s.contacts[k]
+    slip = ca.sqrt(r.slip.gx**2 + r.slip.gy**2 + SLIP_ROUNDING**2)
+    signals = (r.slip.gx, r.slip.gy, slip, r.Vx, float(r.contact.radius) * s.q[k])
+    return p["A"] * _interpolated(effect, signals[int(p["signal"])], p)
+
+
+def _interpolated(effect: str, at: ca.SX, p: Values) -> ca.SX:
+    """Return a table's value at a signal. Raises MachineError for nodes out of order."""
+    x, f = ([float(p[f"{key}{n + 1}"]) for n in range(MAP_NODES)] for key in "xf")
+    if not (np.diff(x) > 0).all():
+        raise MachineError(f"effect {effect}: x1 to x{MAP_NODES} must increase (got {', '.join(f'{v:g}' for v in x)})")
+    value = ca.SX(f[0])
+    for n in range(MAP_NODES - 1):
+        value += (f[n + 1] - f[n]) / (x[n + 1] - x[n]) * (ca.fmin(ca.fmax(at, x[n]), x[n + 1]) - x[n])
+    return value
