@@ -14,6 +14,7 @@ import argparse
 import json
 import os
 import sys
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -23,6 +24,7 @@ from typing import Any
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+import tomli_w
 from joblib import Parallel, delayed
 
 ROOT = Path(__file__).parents[1]
@@ -34,11 +36,23 @@ import excite
 from excite.errors import ExciteError
 from excite.logs.log import table_of
 from excite.smoothing import inverse_fit, solver
+from excite.workflows import machine_from_urdf
 
 SHARED = ROOT.parent / "shared"
 CASES, DATA = SHARED / "cases", SHARED / "data"
 ROUNDING = 1e-10  # of a merit
 Source = Callable[[], tuple[Any, Any]]  # machine and logs
+
+
+def _double_pendulum(folder: Path) -> str:
+    """Return a machine file of the robot's description with the columns of its logs."""
+    machine, _ = machine_from_urdf(folder / "acrobot.urdf", "double_pendulum")
+    for sensor in machine["sensor"]:
+        sensor["column"] = f"{'pos' if sensor['kind'] == 'angle' else 'tau'}_meas{sensor['body']}"
+    machine |= {"sampling_hz": {"value": 500.0, "source": "definition"}, "time_column": "time"}
+    file = Path(tempfile.mkdtemp()) / "double_pendulum.toml"
+    file.write_text(tomli_w.dumps(machine))
+    return str(file)
 
 
 def real_logs() -> dict[str, Source]:
@@ -58,7 +72,9 @@ def real_logs() -> dict[str, Source]:
     for log in ("20_02_12-50sec_12harm", "20_02_19_14harm50sec", "20_02_19_15harm50sec"):
         add(f"ur10e {log[6:8]}.{log[3:5]} {log[9:16]}", "ur10e", f"ur10e/{log}.csv")
     for log in (143339, 143601, 143747):
-        add(f"double pendulum {log}", DATA / "double_pendulum" / "acrobot.urdf", f"double_pendulum/{log}.csv")
+        path = DATA / "double_pendulum" / f"{log}.csv"
+        if path.is_file():
+            found[f"double pendulum {log}"] = lambda path=path: (_double_pendulum(path.parent), [path])
     if "emps" in found:
         for half in (0, 1):
             found[f"emps, half {half + 1}"] = lambda half=half: ("emps", [_half_of_emps(half)])
