@@ -17,7 +17,7 @@ import numpy as np
 
 from excite.errors import MachineError
 from excite.model.base_parameters import BaseParameters, append_parameters, base_parameters
-from excite.model.effects import GroundMap, PlacedEffect, Site, place_effect
+from excite.model.effects import GroundMap, PlacedEffect, Site, place_effect, table_angles
 from excite.model.equations import (
     Equations,
     contact_lines,
@@ -256,9 +256,11 @@ class Model:
         slope = ca.Function("slope", [q, nu, a, *beside], [ca.jacobian(self.predict(q, nu, a, p, *beside), q)])
         rng = np.random.default_rng(0)
         change = np.zeros(len(self.coordinates))
-        for _ in range(5):
+        tables = [x for e in self.effects for x in table_angles(self.machine, e)]  # flat beyond their nodes
+        for shift in (*[0.0] * 5, *tables):
             outside = [rng.uniform(0.1, 1, x.numel()) for x in beside]
-            at = slope(*rng.uniform(-1, 1, (3, len(self.coordinates))), *outside).full()
+            q_here, nu_here, a_here = rng.uniform(-1, 1, (3, len(self.coordinates)))
+            at = slope(shift or q_here, nu_here, a_here, *outside).full()
             change = np.maximum(change, np.abs(at).max(axis=0))
         floor = 1e-9 * float(np.abs(self.nominal).max())
         return tuple(c for c, size in zip(self.coordinates, change, strict=True) if size > floor)

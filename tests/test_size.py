@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST = {
-    "lines": 58_984,
+    "lines": 59_005,
     "named constants": 816,
     "files over 600 lines": 0,
     "functions over 80 lines": 4,

@@ -22,10 +22,10 @@ class Curve:
     """What a model lacks as a smooth function of one signal.
 
     row: name and unit of the torque sensor, or name of the joint or contact. signal: name and unit. at (M,) [signal's
-    unit]. value, std (M,) [row's unit]: without what parameters explain as well, if it is a torque's. percent: by how
-    much the error of that torque on withheld stretches is smaller, with its 95 % interval. entry: the curve as a table
-    in the machine file, with its relative standard deviation. lacks: what the model lacks. together: number of curves
-    that have this gain together, in all signals, 1 for a torque's own.
+    unit]. value, std (M,) [row's unit]: of a diagnosis by regression, without what parameters explain as well. percent:
+    by how much the error of that torque on withheld stretches is smaller, with its 95 % interval; of soil, the error of
+    all signals with all curves. entry: the curve as a table in the machine file, with its relative standard deviation.
+    lacks: what the model lacks. together: number of curves that have this gain together, 1 for a torque's own.
     """
 
     row: tuple[str, str]

@@ -216,9 +216,8 @@ def first_gains(form: Form, chosen: Sequence[Candidate], logs: np.ndarray) -> np
 def _is_impossible(x: Candidate, factor: np.ndarray) -> bool:
     """Tell if a candidate's factor is impossible: of the wrong sign, or beyond the largest amount."""
     effect = x.placed.effect
-    forward = (
-        effect.positive or min(effect.grid, default=-1.0) < 0
-    )  # if negative amounts are tried, too, a step back is one of those
+    # If negative amounts are tried, too, a step back is one of those; a table has no other sign.
+    forward = effect.positive or min(effect.grid, default=-1.0) < 0
     if forward and len(factor) == 1 and factor[0] <= 0:
         return True
     return bool(np.hypot.reduce(factor) * abs(x.placed.values["A"]) > 2 * effect.largest)

@@ -89,7 +89,8 @@ def assess(
     told = dict(zip(map(id, stages), torques if by_torques else errors, strict=True))
     gains = tuple(hold_out.hold_out_gain(told.get(id(x)), told[id(last)]) for x in d.without)
     total_gain = hold_out.hold_out_gain(told[id(d.before)], told[id(last)])
-    if d.verdict == "unexplained" and not by_torques and not deadline.is_over():
+    unnamed = d.verdict == "unexplained" and not d.findings and bool(last.machine.contacts)
+    if unnamed and not by_torques and not deadline.is_over():
         report(0.95, "drawing what is left")
         if (curves := soil_curves.find_soil_curves(last, told[id(last)], runner)) is not None:
             d = replace(d, after=curves.stage, curves=curves.curves, located=anomaly_lines(curves.stage))
@@ -412,11 +413,9 @@ def answer_text(a: Assessment) -> str:
             if d.nearest.reason:
                 text += f", but {d.nearest.reason}"
         if isinstance(d, Diagnosis) and d.curves:
-            c = d.curves[0]
-            forms = "a curve without a name takes" if c.together == 1 else f"{c.together} curves without a name take"
-            text += (
-                f"; {forms} part of it: the error on withheld stretches is {_describe_change(c.percent, c.interval)}"
-            )
+            lacking = ", and ".join(f"{c.row[0]} lacks {c.lacks} that depends on {c.signal[0]}" for c in d.curves)
+            change = _describe_change(d.curves[0].percent, d.curves[0].interval)
+            text += f"; {lacking}, and with that the error on withheld stretches is {change}"
         return text + "."
     remark = ""
     if a.total_gain:

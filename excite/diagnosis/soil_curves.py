@@ -14,7 +14,7 @@ import numpy as np
 
 from excite.diagnosis import evidence
 from excite.diagnosis.acceptance import MIN_STDS
-from excite.diagnosis.curves import CURVE_POINTS, Curve, spline_basis, spline_knots, table_nodes
+from excite.diagnosis.curves import CURVE_POINTS, FUNCTIONS, Curve, spline_basis, spline_knots, table_nodes
 from excite.diagnosis.fits import ExtendedFit, beside_unknown_forces, refit
 from excite.diagnosis.hold_out import STRETCH_S, HoldOutErrors, hold_out_errors, hold_out_gain
 from excite.diagnosis.parallel import CallRunner, run_in_turn
@@ -89,7 +89,7 @@ class Shown:
         at = np.linspace(low, high, CURVE_POINTS)
         every = spline_basis(at, self.along) @ self.coefficients.T
         scatter = np.sqrt((FOLDS - 1) * np.var(every[:, :FOLDS], axis=1))
-        value, std = factor * every[:, -1], np.hypot(factor * scatter, factor_std * every[:, -1])
+        value, std = factor * self.sign * every[:, -1], np.hypot(factor * scatter, factor_std * every[:, -1])
         unit = "N" if self.lack.kind else "N m" if self.lack.body.joint == "revolute" else "N"
         lacks = f"a {self.lack.kind} force" if self.lack.kind else "a torque"
         if self.changes == "stiffness":
@@ -129,6 +129,10 @@ def find_soil_curves(
     errors = hold_out_errors(extended)
     gain = hold_out_gain(before, errors)
     if errors is None or gain is None or gain.interval is None or not gain.interval[0] > 0:
+        return None
+    # The tables were drawn from all of the logs: their values count as parameters (Schwarz, 1978).
+    price = float(np.log(stage.data.n_readings)) * (FUNCTIONS + 1) * len(curves)
+    if stage.exact and extended.exact and stage.deviance - extended.deviance < price * extended.dispersion:
         return None
     drawn = (x.curve(factors[x.label], gain.percent, gain.interval, len(curves)) for x in curves)
     return WithCurves(extended, tuple(drawn), errors)
@@ -185,7 +189,9 @@ def _signals(space: StateSpace, body: Body, trajectory: Trajectory) -> dict[tupl
     """Return the signals (N,) along a log on which a table at a joint or contact may depend, by name and unit."""
     q, nu, _ = space.unpack(trajectory.state)
     machine, unit = space.model.machine, "rad" if body.joint == "revolute" else "m"
-    angle, rate = (machine.joint_positions(body, q.T), machine.joint_values(body, nu.T))
+    angle, rate = np.zeros(len(q)), np.zeros(len(q))
+    if machine.is_free(body):
+        angle, rate = machine.joint_positions(body, q.T), machine.joint_values(body, nu.T)
     if body.contact is None:
         return {("angle", unit): angle, ("speed", f"{unit}/s"): rate}
     features, names = space.features(trajectory.state)[0][:, :, 0], feature_names(space.model)
@@ -202,7 +208,7 @@ def _likeliest(beside: ExtendedFit, lack: Lack) -> list[Shown]:
     body = lack.body if lack.kind else lack.body.model_copy(update={"contact": None})
     along = [_signals(space, body, t) for t in trajectories]
     length = round(STRETCH_S * float(space.model.machine.sampling_hz))
-    fold = np.concatenate([np.arange(len(t.state)) // length % FOLDS for t in trajectories])
+    fold = np.arange(len(lack.values)) // length % FOLDS
     found = []
     for signal in along[0]:
         x = [own[signal] for own in along]
@@ -210,7 +216,8 @@ def _likeliest(beside: ExtendedFit, lack: Lack) -> list[Shown]:
             continue
         B = spline_basis(np.concatenate(x), x)
         for changes, law in lack.laws.items():
-            found.append(Shown(lack, signal, x, changes, *_fit(B * law[:, None], lack.values, fold)))
+            if law.any():
+                found.append(Shown(lack, signal, x, changes, *_fit(B * law[:, None], lack.values, fold)))
     found.sort(key=lambda one: -one.share)
     return [one for one in found[:MOST_FORMS] if one.share > MIN_SHARE]
 

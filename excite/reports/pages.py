@@ -38,7 +38,7 @@ CAPTIONS = {
     "budget.png": "What makes the variance of each parameter: noise with what the model lacks, and the tolerances of"
     " the machine file. What takes a large share is worth measuring.",
     "curves.png": "What the model lacks in each joint or contact as a function of one signal: mean, and its 95 % band."
-    " Flat at zero is right.",
+    " Flat is right.",
     "log.png": "Every channel that the machine file knows, in SI units, over time: as recorded, and as it is used after"
     " repair and resampling.",
     "signals.png": "Left, the share of each signal's error that is systematic, the rest being noise. Right, the error"

@@ -29,5 +29,6 @@ from .tables import (
     MAP_NODES as MAP_NODES,
     SOIL_SIGNALS as SOIL_SIGNALS,
     soil_table as soil_table,
+    table_angles as table_angles,
     torque_table as torque_table,
 )

@@ -10,7 +10,8 @@ import numpy as np
 
 from excite.errors import MachineError
 from excite.model.effects import sizes
-from excite.model.effects.effect import SampleView, Shape, Site, Soil, Values, unit_size
+from excite.model.effects.effect import PlacedEffect, SampleView, Shape, Site, Soil, Values, unit_size
+from excite.model.machine import Machine
 
 MAP_NODES = 11  # rows of the table; chosen
 SIGNALS = ("angle", "speed", "torque")  # in the order of the shape `signal`
@@ -34,7 +35,9 @@ def soil_map_shapes() -> dict[str, Shape]:
     """Declare what a contact's table changes, its signal, nodes and values; a bump of 5 % by default."""
     return {
         "changes": _choice(CHANGES),
-        "signal": _choice(tuple(SOIL_SIGNALS), 0.0),
+        "signal": _choice(
+            [x.replace("rolled distance", "the roll's angle times its radius") for x in SOIL_SIGNALS], 0.0
+        ),
         **_rows("-", sizes.constant(0.05), ", ".join(SOIL_SIGNALS.values()), "force [N] or share of the stiffness"),
     }
 
@@ -128,3 +131,14 @@ def _interpolated(effect: str, at: ca.SX, p: Values) -> ca.SX:
     for n in range(MAP_NODES - 1):
         value += (f[n + 1] - f[n]) / (x[n + 1] - x[n]) * (ca.fmin(ca.fmax(at, x[n]), x[n + 1]) - x[n])
     return value
+
+
+def table_angles(machine: Machine, placed: PlacedEffect) -> list[float]:
+    """Return angles or positions [rad, m] between the nodes of an effect's table, none for an effect without one."""
+    if "x1" not in placed.values:
+        return []
+    x = np.array([placed.values[f"x{n + 1}"] for n in range(MAP_NODES)])
+    contact = machine.find(placed.bodies[0]).contact
+    scale = float(contact.radius) if contact is not None and placed.effect.soil is not None else 1.0
+    middles: list[float] = ((x[1:] + x[:-1]) / (2 * scale)).tolist()
+    return middles

@@ -239,6 +239,15 @@ def test_a_map_of_the_soil_adds_a_force_or_a_share_of_a_stiffness(va12: Model, a
     np.testing.assert_allclose(more[3], R * force if axis == "lengthwise" else 0.0, atol=1e-6)
 
 
+@pytest.mark.parametrize("begin", [-6.0, 1.0, 50.0])
+def test_a_map_of_the_rolled_distance_needs_the_rolls_angle_wherever_it_begins(begin: float) -> None:
+    x = begin + np.arange(MAP_NODES)
+    table = soil_table("rolled distance", x.tolist(), np.sin(x).tolist(), "stiffness")
+    straight = machine.load_machine("va12_straight")
+    model = build(placing.with_effects(straight, shaped("lengthwise_map@front_roll=1", table, straight)))
+    assert model.active_coordinates == ("theta1",)
+
+
 @pytest.mark.parametrize("slow", [0.0, 0.6])
 def test_dry_friction_may_turn_more_suddenly(va12: Model, slow: float) -> None:
     """From the formula: at rates from far within to far beyond the one over which it turns."""
