@@ -78,7 +78,7 @@ def test_unknown_objective_is_refused() -> None:
 
 def test_rows_count_by_what_disturbs_them(va12: Model) -> None:
     """Torque rows by their sensor, the root's by the torque noise that the rolls pass on."""
-    noise = dict(zip(va12.rows, objective.row_noise(va12), strict=True))
+    noise = dict(zip(va12.coordinates, objective.row_noise(va12), strict=True))
     assert (noise["theta1"], noise["theta2"], noise["theta4"]) == (40, 100, 40)
     assert noise["x0"] == noise["y0"] == pytest.approx(40 / 0.65)
 
