@@ -14,7 +14,6 @@ import argparse
 import json
 import os
 import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -24,7 +23,6 @@ from typing import Any
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import tomli_w
 from joblib import Parallel, delayed
 
 ROOT = Path(__file__).parents[1]
@@ -35,6 +33,8 @@ from support.several import DRIVES, draw, drives_of, names_of, simulated
 import excite
 from excite.errors import ExciteError
 from excite.logs.log import table_of
+from excite.model import Model, build
+from excite.model.machine import Machine
 from excite.smoothing import inverse_fit, solver
 from excite.workflows import machine_from_urdf
 
@@ -44,15 +44,13 @@ ROUNDING = 1e-10  # of a merit
 Source = Callable[[], tuple[Any, Any]]  # machine and logs
 
 
-def _double_pendulum(folder: Path) -> str:
-    """Return a machine file of the robot's description with the columns of its logs."""
+def _double_pendulum(folder: Path) -> Model:
+    """Return the model of the robot's description with the columns of its logs."""
     machine, _ = machine_from_urdf(folder / "acrobot.urdf", "double_pendulum")
     for sensor in machine["sensor"]:
         sensor["column"] = f"{'pos' if sensor['kind'] == 'angle' else 'tau'}_meas{sensor['body']}"
     machine |= {"sampling_hz": {"value": 500.0, "source": "definition"}, "time_column": "time"}
-    file = Path(tempfile.mkdtemp()) / "double_pendulum.toml"
-    file.write_text(tomli_w.dumps(machine))
-    return str(file)
+    return build(Machine.model_validate(machine))
 
 
 def real_logs() -> dict[str, Source]:

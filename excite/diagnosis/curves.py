@@ -9,7 +9,7 @@ import numpy as np
 import scipy.interpolate
 
 from excite.model.effects import MAP_NODES
-from excite.model.machine import EffectEntry
+from excite.model.machine import EffectEntry, Quantity
 from excite.text import format_number, format_percent, format_uncertain
 
 KNOTS = (MAP_NODES + 1) // 2  # of a curve: every second node of its table
@@ -19,7 +19,7 @@ CURVE_POINTS = 41  # of a curve
 
 @dataclass(frozen=True)
 class Curve:
-    """What a model lacks as a smooth function of one signal.
+    """A smooth function of one signal that a model lacks.
 
     row: name and unit of the torque sensor, or name of the joint or contact. signal: name and unit. at (M,) [signal's
     unit]. value, std (M,) [row's unit]: of a diagnosis by regression, without what parameters explain as well. percent:
@@ -75,3 +75,14 @@ def table_nodes(along: Sequence[np.ndarray]) -> np.ndarray:
         widest = int(np.argmax(np.diff(x)))
         x = np.insert(x, widest + 1, x[widest : widest + 2].mean())
     return x
+
+
+def curve_points(along: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the points (CURVE_POINTS,) at which a curve is drawn: all of its signal but the extremes."""
+    low, high = (float(x) for x in np.quantile(np.concatenate(list(along)), [0.01, 0.99]))
+    return np.linspace(low, high, CURVE_POINTS)
+
+
+def relative_std(value: np.ndarray, std: np.ndarray) -> Quantity:
+    """Return the standard deviation of a curve's amount, 1, from those of its values."""
+    return Quantity(value=float(np.sqrt(np.mean(std**2) / np.mean(value**2))), source="identified")

@@ -94,7 +94,7 @@ def assess(
         report(0.95, "drawing what is left")
         if (curves := soil_curves.find_soil_curves(last, told[id(last)], runner)) is not None:
             d = replace(d, after=curves.stage, curves=curves.curves, located=anomaly_lines(curves.stage))
-            total_gain = hold_out.hold_out_gain(told[id(d.before)], curves.errors)
+            total_gain = curves.gain
     before = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.before.alone))
     extended = d.findings or d.curves
     after = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.after.alone)) if extended else before

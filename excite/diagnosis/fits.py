@@ -337,25 +337,30 @@ def _follow(
         raise NotConvergedError("exact dynamics do not follow the logs")
     known = None if before is None or before.exact else smoothing.FitBeside(before.fit, before.measurements)
     rounds = ROUNDS_BESIDE if known is None else ROUNDS_BESIDE[-1:]
-    beside = smoothing.fit_unknown_forces(
-        data.space, data.measurements, data.starts, data.held, rounds, True, (X, trajectories), known
+    return _beside(data, rounds, (X, trajectories), known)
+
+
+def _beside(
+    data: FitData,
+    rounds: Sequence[Settings],
+    first: tuple[np.ndarray, Sequence[Trajectory]],
+    known: smoothing.FitBeside | None = None,
+) -> Fitted:
+    """Fit beside unknown forces; arguments as `fit_unknown_forces` has them. Raises NotConvergedError."""
+    found = smoothing.fit_unknown_forces(
+        data.space, data.measurements, data.starts, data.held, rounds, True, first, known
     )
-    if not beside.fit.linear:
-        beside.fit.required()
-    return without_smoother_levels(beside.fit), beside.measurements
+    if not found.fit.linear:
+        found.fit.required()
+    return without_smoother_levels(found.fit), found.measurements
 
 
 def beside_unknown_forces(stage: ExtendedFit) -> ExtendedFit:
     """Return a fit beside unknown forces, also where exact dynamics follow the logs. Raises NotConvergedError."""
     if not stage.exact:
         return stage
-    data, first = stage.data, (stage.fit.X, stage.fit.trajectories)
-    found = smoothing.fit_unknown_forces(
-        data.space, data.measurements, data.starts, data.held, ROUNDS_BESIDE, True, first
-    )
-    if not found.fit.linear:
-        found.fit.required()
-    return replace(stage, fit=without_smoother_levels(found.fit), measurements=found.measurements)
+    fit, measurements = _beside(stage.data, ROUNDS_BESIDE, (stage.fit.X, stage.fit.trajectories))
+    return replace(stage, fit=fit, measurements=measurements)
 
 
 def _continued(machine: Machine, previous: ExtendedFit) -> tuple[FitData, list[Trajectory], np.ndarray]:

@@ -8,13 +8,13 @@ from functools import partial
 
 import numpy as np
 
-from excite.diagnosis.curves import CURVE_POINTS, FUNCTIONS, Curve, spline_basis, table_nodes
+from excite.diagnosis.curves import FUNCTIONS, Curve, curve_points, relative_std, spline_basis, table_nodes
 from excite.diagnosis.hold_out import HoldOutErrors, hold_out_gain, torque_names
 from excite.diagnosis.selection import ProgressCallback, identified_entry
 from excite.diagnosis.torque_fit import Term, TorqueFit, normalise
 from excite.diagnosis.torque_search import MIN_UNABSORBED_SHARE, predicts_better
 from excite.model.effects import torque_table
-from excite.model.machine import Body, EffectEntry, Quantity
+from excite.model.machine import Body, EffectEntry
 
 FINALIST_CURVES = 3  # signals of a torque that are tried on withheld stretches; chosen
 
@@ -46,8 +46,7 @@ def find_curves(fit: TorqueFit, torques: Sequence[np.ndarray], report: ProgressC
             if gain is None or gain.interval is None or not gain.interval[0] > 0:
                 continue
             if best is None or gain.percent > best.percent:
-                low, high = (float(x) for x in np.quantile(np.concatenate(signal.values), [0.01, 0.99]))
-                at = np.linspace(low, high, CURVE_POINTS)
+                at = curve_points(signal.values)
                 value, std = _evaluate(new, term, signal, at)
                 best = Curve(
                     torque_names(model.machine)[k],
@@ -153,7 +152,6 @@ def _entry(fit: TorqueFit, term: Term, signal: Signal, body: Body) -> EffectEntr
     """Return a curve as a table, at the knots and midway between them."""
     x = table_nodes(signal.values)
     f, std = _evaluate(fit, term, signal, x)
-    relative = float(np.sqrt(np.mean(std**2) / np.mean(f**2)))
     shapes = torque_table(signal.kind, signal.body.index, x.tolist(), f.tolist())
     entry = identified_entry("torque_map", body.where, 1.0, shapes)
-    return entry.model_copy(update={"std": Quantity(value=relative, source="identified")})
+    return entry.model_copy(update={"std": relative_std(f, std)})

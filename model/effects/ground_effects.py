@@ -155,36 +155,25 @@ SOIL = (
     ),
 )
 
-TABLE = "piecewise linear basis: Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., 5.2"
-NO_CAUSE = "; a diagnosis fits it to what no other effect explains, and never names it as a cause"
-TABLES = (
-    Effect(
-        "lengthwise_map",
+
+def _soil_map(way: str, axis: str, stiffness: str) -> Effect:
+    """Declare a table of the soil's force along or across (axis) a contact; stiffness: name of the parameter."""
+    return Effect(
+        f"{way}_map",
         ("contacts",),
         "-",
-        "a force along the contact, or a share by which Kx is larger, by a table of slip, speed or the distance rolled,"
-        f" times A{NO_CAUSE}",
-        "a lengthwise force that the soil's law lacks, a function of one signal",
-        TABLE,
+        f"a force {axis} the contact, or a share by which {stiffness} is larger, by a table of slip, speed or the"
+        f" distance rolled (the roll's angle times its radius), times A{tables.NO_CAUSE}",
+        f"a {way} force that the soil's law lacks, a function of one signal",
+        tables.SOURCE,
         sizes.constant(1.0),
         tables.soil_map_shapes(),
         grid=(),
-        soil=tables.lengthwise_by_table,
-    ),
-    Effect(
-        "lateral_map",
-        ("contacts",),
-        "-",
-        "a force across the contact, or a share by which Ky is larger, by a table of slip, speed or the distance"
-        f" rolled, times A{NO_CAUSE}",
-        "a lateral force that the soil's law lacks, a function of one signal",
-        TABLE,
-        sizes.constant(1.0),
-        tables.soil_map_shapes(),
-        grid=(),
-        soil=tables.lateral_by_table,
-    ),
-)
+        soil=tables.soil_by_table(f"{way}_map", axis, stiffness),
+    )
+
+
+TABLES = (_soil_map("lengthwise", "along", "Kx"), _soil_map("lateral", "across", "Ky"))
 
 FORCES = (
     Effect(

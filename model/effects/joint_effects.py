@@ -252,10 +252,9 @@ FRICTION = (
         "torque_map",
         ("drives",),
         "-",
-        "resistance by a table of the angle, speed or torque of a joint, times A; a diagnosis fits it to what no other"
-        " effect explains, and never names it as a cause",
+        f"resistance by a table of the angle, speed or torque of a joint, times A{tables.NO_CAUSE}",
         "a torque error that is a function of one signal",
-        "piecewise linear basis: Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., 5.2",
+        tables.SOURCE,
         sizes.constant(1.0),
         tables.torque_map_shapes(),
         grid=(),

@@ -19,6 +19,8 @@ CHANGES = ("force", "stiffness")  # by the shape `changes`
 # By `signal`, with units.
 SOIL_SIGNALS = {"lengthwise slip": "-", "lateral slip": "-", "slip": "-", "speed": "m/s", "rolled distance": "m"}
 SLIP_ROUNDING = 1e-4  # below which the resultant slip is round
+NO_CAUSE = "; a diagnosis fits it to what no other effect explains, and never names it as a cause"
+SOURCE = "piecewise linear basis: Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., 5.2"
 _NODES = tuple(np.linspace(-1, 1, MAP_NODES))
 
 
@@ -35,9 +37,7 @@ def soil_map_shapes() -> dict[str, Shape]:
     """Declare what a contact's table changes, its signal, nodes and values; a bump of 5 % by default."""
     return {
         "changes": _choice(CHANGES),
-        "signal": _choice(
-            [x.replace("rolled distance", "the roll's angle times its radius") for x in SOIL_SIGNALS], 0.0
-        ),
+        "signal": _choice(tuple(SOIL_SIGNALS), 0.0),
         **_rows("-", sizes.constant(0.05), ", ".join(SOIL_SIGNALS.values()), "force [N] or share of the stiffness"),
     }
 
@@ -92,34 +92,23 @@ def resist_by_table(s: SampleView, k: int, p: Values) -> ca.SX:
     return -p["A"] * _interpolated("torque_map", own[k if of < 0 else of], p)
 
 
-def lengthwise_by_table(s: SampleView, k: int, p: Values, soil: Soil) -> Soil:
-    """Add a table to the force along a contact, or change Kx by its share. Raises MachineError."""
-    value = _soil_value("lengthwise_map", s, k, p)
-    along, across = soil.added
-    if _adds_force(p):
-        return replace(soil, added=(along + value, across))
-    return replace(soil, Kx=soil.Kx * (1 + value))
+def soil_by_table(effect: str, axis: str, stiffness: str) -> Callable[[SampleView, int, Values, Soil], Soil]:
+    """Return the hook of a table that adds to the force along or across (axis) a contact, or changes Kx or Ky.
 
+    The hook raises MachineError for nodes out of order.
+    """
 
-def lateral_by_table(s: SampleView, k: int, p: Values, soil: Soil) -> Soil:
-    """Add a table to the force across a contact, or change Ky by its share. Raises MachineError."""
-    value = _soil_value("lateral_map", s, k, p)
-    along, across = soil.added
-    if _adds_force(p):
-        return replace(soil, added=(along, across + value))
-    return replace(soil, Ky=soil.Ky * (1 + value))
+    def changed(s: SampleView, k: int, p: Values, soil: Soil) -> Soil:
+        r = s.contacts[k]
+        slip = ca.sqrt(r.slip.gx**2 + r.slip.gy**2 + SLIP_ROUNDING**2)
+        signals = (r.slip.gx, r.slip.gy, slip, r.Vx, float(r.contact.radius) * s.q[k])
+        value = p["A"] * _interpolated(effect, signals[int(p["signal"])], p)
+        if CHANGES[int(p["changes"])] == "force":
+            along, across = soil.added
+            return replace(soil, added=(along + value, across) if axis == "along" else (along, across + value))
+        return replace(soil, **{stiffness: getattr(soil, stiffness) * (1 + value)})
 
-
-def _adds_force(p: Values) -> bool:
-    return CHANGES[int(p["changes"])] == "force"
-
-
-def _soil_value(effect: str, s: SampleView, k: int, p: Values) -> ca.SX:
-    """Return A times the table at a contact's signal."""
-    r = s.contacts[k]
-    slip = ca.sqrt(r.slip.gx**2 + r.slip.gy**2 + SLIP_ROUNDING**2)
-    signals = (r.slip.gx, r.slip.gy, slip, r.Vx, float(r.contact.radius) * s.q[k])
-    return p["A"] * _interpolated(effect, signals[int(p["signal"])], p)
+    return changed
 
 
 def _interpolated(effect: str, at: ca.SX, p: Values) -> ca.SX:
