@@ -122,6 +122,11 @@ class Diagnosis:
     curves: tuple[Curve, ...] = ()
 
     @property
+    def extended(self) -> bool:
+        """Tell if the model `after` has more than that `before`."""
+        return bool(self.findings or self.curves)
+
+    @property
     def sources(self) -> tuple[str, ...]:
         """Names of the logs."""
         return tuple(log.source for log in self.before.data.logs)

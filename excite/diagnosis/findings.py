@@ -96,8 +96,7 @@ def assess(
             d = replace(d, after=curves.stage, curves=curves.curves, located=anomaly_lines(curves.stage))
             total_gain = curves.gain
     before = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.before.alone))
-    extended = d.findings or d.curves
-    after = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.after.alone)) if extended else before
+    after = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.after.alone)) if d.extended else before
     located = d.located
     if d.verdict == "unexplained":  # replace lines of suspect sensors by located misfits
         other_lines = [line for line in d.located if line not in d.after.suspect_sensors]
@@ -268,7 +267,6 @@ def assess_torques(d: TorqueDiagnosis, errors: Sequence[HoldOutErrors]) -> Asses
 def summarise(a: Assessment) -> dict[str, Any]:
     """Return the summary of `excite diagnose`, ready for JSON."""
     d = a.diagnosis
-    extended = d.findings or d.curves
     return {
         "verdict": d.verdict,
         "answer": answer_text(a),
@@ -276,8 +274,8 @@ def summarise(a: Assessment) -> dict[str, Any]:
         "differences": None if a.differences is None else identification.summarise_agreement(a.differences),
         "error_before_percent": a.total_gain.before if a.total_gain else None,
         "error_after_percent": a.total_gain.after if a.total_gain else None,
-        "gain_percent": a.total_gain.percent if a.total_gain and extended else None,
-        "gain_ci95": _interval_list(a.total_gain) if extended else None,
+        "gain_percent": a.total_gain.percent if a.total_gain and d.extended else None,
+        "gain_ci95": _interval_list(a.total_gain) if d.extended else None,
         "signals": signal_table(a),
         "separating_run": a.separating_run,
         "share_explained": d.share,

@@ -58,6 +58,10 @@ class TorqueDiagnosis:
     nearest: NearestEffect | None = None
 
     @property
+    def extended(self) -> bool:
+        return bool(self.findings)
+
+    @property
     def sources(self) -> tuple[str, ...]:
         return tuple(r.log.source for r in self.after.rows)
 

@@ -97,7 +97,7 @@ def _figures(d: Diagnosis, title: str, kinds: Sequence[str]) -> Iterator[tuple[s
     """Yield some of the figures for every log, each with its file."""
     before, after = d.before, d.after
     without = diagnosis.residuals_of_logs(before)
-    beside = diagnosis.residuals_of_logs(after) if d.findings or d.curves else [None] * len(without)
+    beside = diagnosis.residuals_of_logs(after) if d.extended else [None] * len(without)
     draws: dict[str, Callable[..., Figure]] = {
         **KINDS,
         "when": partial(when_figure, words=signal_descriptions(before.machine)),

@@ -160,9 +160,8 @@ def diagnose_account(
     }
     keys = ("kind", "amount", "amount_std", "unit", "share_percent", "p_value", "gain_percent", "gain_ci95")
     rows = {f"{f['effect']}@{f['where']}": {k: f[k] for k in keys} for f in summary["findings"]}
-    extended = bool(d.findings or d.curves)
     words = signal_descriptions(model.machine)
-    signals = partial(reports.signals_figure, summary["signals"], extended, title, words)
+    signals = partial(reports.signals_figure, summary["signals"], d.extended, title, words)
     return Account(
         "diagnose",
         reports.with_sentences("diagnose", summary),

@@ -398,7 +398,7 @@ def test_a_figure_says_that_nothing_could_be_withheld() -> None:
 def test_every_log_is_drawn(findings: tuple[str, ...], straight: Model, tmp_path: Path) -> None:
     logs = [make_log(straight, gentle(straight, 6.0), seed=k) for k in (3, 4)]
     stage = fits.fit_machine(straight.machine, logs, straight.machine.filter)
-    d: Any = SimpleNamespace(before=stage, after=stage, findings=findings, curves=())
+    d: Any = SimpleNamespace(before=stage, after=stage, findings=findings, curves=(), extended=bool(findings))
     for draw in diagnosis_figures.figure_calls(tmp_path, d, "a roller"):
         draw()
     drawn = {p.name for p in tmp_path.iterdir()}

@@ -15,8 +15,9 @@ import scipy.signal
 from support.drives import arm_motion
 from support.files import SHARED
 
-from excite.diagnosis import count_false_alarms, explain, machine_file
+from excite.diagnosis import count_false_alarms, explain, machine_file, summarise
 from excite.diagnosis.deadline import Deadline
+from excite.diagnosis.findings import assess_torques
 from excite.diagnosis.torque_fit import Whitening, course_gains, find_whitening, innovations
 from excite.diagnosis.torque_regression import TorqueDiagnosis, diagnose_torques
 from excite.errors import NotIdentifiableError
@@ -187,6 +188,14 @@ def test_a_force_that_no_effect_has_is_drawn_as_a_curve(emps: Model) -> None:
     off = curve.value - true - np.mean(curve.value - true)
     assert np.mean(np.abs(off) < 3 * curve.std) > 0.85
     assert np.ptp(curve.value) == pytest.approx(8.0, rel=0.3)
+
+
+def test_a_curve_alone_gives_the_findings_no_gain(emps: Model) -> None:
+    """Its own gain is told with it: that of no finding would be 0 %, which nobody measured."""
+    ready = prepare(emps, [rig_log(0, lambda q, v, F: 4 * np.sin(2 * np.pi * q / 0.4))], needed_sensors(emps, "ols"))
+    summary = summarise(assess_torques(*diagnose_torques(ready.model, ready.logs, ready.model.machine.filter)))
+    assert not summary["findings"]
+    assert (summary["gain_percent"], summary["gain_ci95"]) == (None, None)
 
 
 def test_a_curve_goes_into_the_machine_file_and_holds_on_another_log(emps: Model, tmp_path: Path) -> None:
